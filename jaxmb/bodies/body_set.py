@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.arrays import is_traced, namespace, replaced
-from ..linalg.inertia import AbstractInertia, BlockInertia, DiagonalInertia
+from ..linalg.inertia import AbstractInertia, BlockInertia, CoupledInertia, DiagonalInertia
 from ..linalg.rotations import cross, normalize, rotate
 from ..linalg.sums import placed_sums, unchecked_take
 from .groups import Acting, BodyGroup, BodyPoses, BodyVelocities, ConstraintGroup, CoordinateGroup, Kinematics
@@ -130,9 +130,8 @@ class BodySet(eqx.Module):
 
     def _places(self, group):
         """Indices in q of the counts of turns of stacked tendons, shape (parts, rows)."""
-        # They follow the bodies.
-        first = int(np.sum(self.layout.is_place(group.group.bodies[0])))
-        return self.layout.pose_index[group.group.body_index[:, first : first + group.rows], 0]
+        # They are the last of a tendon's bodies.
+        return self.layout.pose_index[group.group.body_index[:, -group.rows :], 0]
 
     # Invariants of the coordinates: counts of turns, and Euler parameters of length one
 
@@ -188,8 +187,26 @@ class BodySet(eqx.Module):
 
     # Inertia and forces
 
-    def inertia(self, of_scalars: Sequence[tuple[np.ndarray, Array]]) -> AbstractInertia:
+    @property
+    def flexible(self) -> tuple[Any, ...]:
+        """The groups of flexible bodies."""
+        return tuple(g for g in self.groups if g.is_flexible)
+
+    def inertia(self, q: Coordinates, of_scalars: Sequence[tuple[np.ndarray, Array]]) -> AbstractInertia:
         """M, from the bodies and pairs `of_scalars`: indices of scalar coordinates, and their inertias."""
+        rigid = self._rigid_inertia(of_scalars)
+        if not self.layout.flexible:
+            return rigid
+        poses, index = self.prepared_poses(q), self.layout.mass_index
+        velocities = lambda bodies: tuple(tuple(row[row < self.layout.nu].tolist()) for row in index[bodies])
+        return CoupledInertia(
+            rigid,
+            tuple(g.mass_matrices(poses) for g in self.flexible),
+            tuple(velocities(g.group.body_index[:, 0]) for g in self.flexible),
+        )
+
+    def _rigid_inertia(self, of_scalars):
+        """M of rigid bodies and scalar coordinates; entries of flexible bodies have no meaning."""
         if self.layout.spatial and self.layout.uniform:
             return BlockInertia(self.mass, self.moments_of_inertia)
         mass = self._masses_of_coordinates(of_scalars)
@@ -211,29 +228,39 @@ class BodySet(eqx.Module):
     def _masses_of_coordinates(self, of_scalars):
         """The entry of each body and scalar coordinate in the mass matrix, [kg] or [kg m²].
 
-        Coordinates that do not move have the entry 1, which has no effect.
+        Coordinates that do not move, and modal coordinates, have the entry 1, which has no effect.
         """
         if not self.layout.scalars:
             return self.mass
-        fixed = [k for k, scalar in enumerate(self.layout.scalars, self.layout.bodies) if not scalar.moves]
+        modal = [k for _, *modes in self.layout.flexible for k in modes]
+        fixed = [
+            k for k, scalar in enumerate(self.layout.scalars, self.layout.bodies) if not scalar.moves or k in modal
+        ]
         order = np.argsort(np.concatenate([*(numbers for numbers, _ in of_scalars), fixed]).astype(int))
         ones = jnp.ones(len(fixed), self.mass.dtype)
         inertias = unchecked_take(jnp.concatenate([*(inertia for _, inertia in of_scalars), ones]), order)
         return jnp.concatenate([self.mass, inertias])
 
     def wrenches(self, now: Kinematics, gravity: Float[Array, "d"] | None) -> list[Acting]:
-        """The sum of gravity and the gyroscopic moment `−ω × J ω`; empty if the scene has neither."""
+        """Gravity, and inertia forces without accelerations, such as the gyroscopic moment `−ω × J ω`."""
         size, dimension = self.layout.space.velocity_size, self.layout.space.dimension
-        parts = []
+        parts, coupled = [], [(g.wrenches(now, gravity), g.group.body_index) for g in self.flexible]
         if gravity is not None:
-            parts.append(jnp.pad(self.mass[:, None] * gravity[None, :], ((0, 0), (0, size - dimension))))
+            mass = self._of_rigid(self.mass)
+            parts.append(jnp.pad(mass[:, None] * gravity[None, :], ((0, 0), (0, size - dimension))))
         if self.layout.turning:
             omega = now.velocities[: self.layout.bodies, 3:]
-            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(self.moments_of_inertia, omega)
+            moments = self._of_rigid(self.moments_of_inertia)
+            moment = -jax.vmap(lambda J, w: cross(w, J @ w))(moments, omega)
             parts.append(jnp.pad(moment, ((0, 0), (3, 0))))
         if not parts:
-            return []
-        return [(sum(parts[1:], start=parts[0]), np.arange(self.layout.bodies)[:, None])]
+            return coupled
+        return [(sum(parts[1:], start=parts[0]), np.arange(self.layout.bodies)[:, None]), *coupled]
+
+    def _of_rigid(self, of_bodies):
+        """Values of the bodies, with zeros for flexible bodies."""
+        flexible = [body for body, *_ in self.layout.flexible]
+        return of_bodies.at[np.array(flexible)].set(0.0) if flexible else of_bodies
 
     def generalized_force(self, acting: Sequence[Acting], u: Velocities) -> Float[Array, "nu"]:
         """The generalized force of wrenches on bodies."""
@@ -255,24 +282,26 @@ class BodySet(eqx.Module):
         blocks = jax.vmap(jax.jacfwd(moment, argnums=1))(self.moments_of_inertia, omega)
         return jnp.pad(blocks, ((0, len(self.layout.scalars)), (3, 0), (3, 0)))
 
-    def potential_energy(self, q: Coordinates, gravity: Float[Array, "d"]) -> Float[Array, ""]:
-        """Potential energy [J] in a field of gravity."""
-        return -jnp.sum(self.mass * (self.poses(q)[:, : self.layout.space.dimension] @ gravity))
+    def potential_energy(self, q: Coordinates, gravity: Float[Array, "d"] | None) -> list[Float[Array, ""]]:
+        """Potential energies [J] in a field of gravity, and of the elasticity of flexible bodies."""
+        out = [g.energy(self.prepared_poses(q), gravity) for g in self.flexible]
+        if gravity is None:
+            return out
+        heights = self.poses(q)[:, : self.layout.space.dimension] @ gravity
+        return [-jnp.sum(self._of_rigid(self.mass) * heights), *out]
 
-    def linear_momentum(self, u: Velocities) -> Float[Array, "d"]:
-        """Linear momentum [kg m/s]."""
-        return self.mass @ self.velocities(u)[:, : self.layout.space.dimension]
+    def linear_momentum(self, p: Velocities) -> Float[Array, "d"]:
+        """Linear momentum [kg m/s], from the momenta `M u`."""
+        return jnp.sum(self.velocities(p)[:, : self.layout.space.dimension], axis=0)
 
-    def angular_momentum(self, q: Coordinates, u: Velocities) -> Float[Array, "*d"]:
-        """Angular momentum [kg m²/s] about the world origin."""
-        poses, velocities = self.poses(q), self.velocities(u)
+    def angular_momentum(self, q: Coordinates, p: Velocities) -> Float[Array, "*d"]:
+        """Angular momentum [kg m²/s] about the world origin, from the momenta `M u`."""
+        poses, momenta = self.poses(q), self.velocities(p)
         if not self.layout.spatial:
-            x, v = poses[:, :2], velocities[:, :2]
-            orbital = self.mass * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0])
-            return jnp.sum(orbital + self.moments_of_inertia * velocities[:, 2])
-        spin = jax.vmap(lambda p, J, w: rotate(p, J @ w))(poses[:, 3:], self.moments_of_inertia, velocities[:, 3:])
-        orbital = jax.vmap(cross)(poses[:, :3], self.mass[:, None] * velocities[:, :3])
-        return jnp.sum(spin + orbital, axis=0)
+            x, of_translation = poses[:, :2], momenta[:, :2]
+            return jnp.sum(x[:, 0] * of_translation[:, 1] - x[:, 1] * of_translation[:, 0] + momenta[:, 2])
+        spin = jax.vmap(rotate)(poses[:, 3:], momenta[:, 3:])
+        return jnp.sum(spin + jax.vmap(cross)(poses[:, :3], momenta[:, :3]), axis=0)
 
 
 class _MixedInertia(AbstractInertia):

@@ -308,7 +308,8 @@ class HostRows(_Rows):
 
 def is_elementary(group: AbstractConstraintGroup) -> bool:
     """Whether elements give the rows of stacked joints."""
-    return group.is_position and not group.group.inputs and group.group.part.declares("elements")
+    part = group.group.part
+    return group.is_position and not (group.group.inputs or part.modal_rows) and part.declares("elements")
 
 
 def elementary_rows(groups: Sequence[AbstractConstraintGroup], ground: int) -> ElementaryRows | None:

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._captured import Captured
 from .._types import Scalar
 from ..linalg.blocks import vector_products
+from ..linalg.rotations import cross
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.boundary import captured
@@ -216,8 +217,8 @@ def stack(
         key = (structure, tuple(leaf.shape for leaf in leaves), len(bodies))
         if key not in groups:
             if check is not None:
-                check(part, layout.space, len(bodies))
-            part_now, kernels, of_time = captured(anonymous(part), layout.space, len(bodies))
+                check(part, layout.space, len(bodies) - part.modal_rows)
+            part_now, kernels, of_time = captured(anonymous(part), layout.space, len(bodies) - part.modal_rows)
             structures[key] = jtu.tree_structure(part_now), {"kernels": tuple(kernels.items()), "of_time": of_time}
         groups.setdefault(key, []).append((leaves, part.name, bodies, list(inner_parts(part))))
     out = []
@@ -329,6 +330,8 @@ class AbstractGroup(eqx.Module):
 class BodyGroup(AbstractGroup):
     """Stacked bodies."""
 
+    is_flexible: ClassVar[bool] = False
+
     @property
     def mass(self) -> Float[Array, "parts"]:
         """Masses [kg]."""
@@ -338,6 +341,77 @@ class BodyGroup(AbstractGroup):
     def inertia(self) -> Float[Array, "parts *matrix"]:
         """Moments of inertia [kg m²] about the mass centres."""
         return jax.vmap(self.group.kernel("inertia"))(self.group.part)
+
+
+class FlexibleGroup(BodyGroup):
+    """Stacked flexible bodies; the bodies of each are the body and its modal coordinates.
+
+    Source: P. C. Hughes, "Spacecraft Attitude Dynamics", Wiley, 1986, chapter 3 (momenta of a deformable body in its
+    frame).
+    """
+
+    is_flexible: ClassVar[bool] = True
+
+    def _matrix(self, part, zeta):
+        return self.group.kernel("mass_matrix")(part, zeta)
+
+    def mass_matrices(self, poses: BodyPoses) -> Float[Array, "parts n n"]:
+        """Mass matrices for the velocities of the bodies, in world axes, and of the modal coordinates."""
+        d = self._space.dimension
+
+        def single(at, x):
+            matrix = self._matrix(at(0.0), x[1:, 0])
+            turned = jax.vmap(functools.partial(self._space.body_direction, x[0]), out_axes=1)
+            to_body = jnp.eye(len(matrix), dtype=x.dtype).at[:d, :d].set(turned(jnp.eye(d, dtype=x.dtype)))
+            return to_body.T @ matrix @ to_body
+
+        return self._map(single, poses)
+
+    def wrenches(self, now: Kinematics, gravity: Float[Array, "d"] | None) -> Float[Array, "parts k v"]:
+        """Wrenches of gravity, of elasticity, and of the inertia forces without accelerations."""
+        return self._map(functools.partial(self._wrenches, gravity), now.poses, now.velocities)
+
+    def _wrenches(self, gravity, at, x, v):
+        space, part, d, size = self._space, at(0.0), self._space.dimension, self._space.velocity_size
+        kernel, zeta, rates = self.group.kernel, x[1:, 0], v[1:, 0]
+        in_body = lambda pose, velocity: jnp.concatenate([space.body_direction(pose, velocity), v[0, d:], rates])
+        in_world = lambda pose, p: jnp.concatenate([space.direction(pose, p[:d]), p[d:]])
+
+        def momenta(pose, zeta):
+            return in_world(pose, self._matrix(part, zeta) @ in_body(pose, v[0, :d]))
+
+        w = in_body(x[0], v[0, :d])
+        momentum = self._matrix(part, zeta) @ w
+        _, rate = jax.jvp(momenta, (x[0], zeta), (space.rates(x[0], v[0]), rates))
+        origin = space.prepare(jnp.asarray(space.ground, x.dtype))
+        turning = space.force_at(origin, w[:d], momentum[:d])[d:]
+        if d == 3:
+            turning = turning + cross(w[3:6], momentum[3:6])
+        energy = lambda zeta: 0.5 * w @ self._matrix(part, zeta) @ w - kernel("energy")(part, zeta)
+        along = jax.grad(energy)(zeta) + kernel("internal_force")(part, zeta, rates)
+        force = jnp.concatenate([jnp.zeros(d, x.dtype), -turning, along]) - rate
+        if gravity is not None:
+            # A field of gravity is an acceleration of the frame.
+            falling = jnp.pad(space.body_direction(x[0], gravity), (0, len(momentum) - d))
+            force = force + in_world(x[0], self._matrix(part, zeta) @ falling)
+        modal = jnp.pad(force[size:, None], ((0, 0), (0, size - 1)))
+        return jnp.concatenate([force[None, :size], modal])
+
+    def energy(self, poses: BodyPoses, gravity: Float[Array, "d"] | None) -> Float[Array, ""]:
+        """Potential energy [J] of gravity and elasticity."""
+        space, d = self._space, self._space.dimension
+
+        def single(at, x):
+            part, zeta = at(0.0), x[1:, 0]
+            energy = self.group.kernel("energy")(part, zeta)
+            if gravity is None:
+                return energy
+            matrix = self._matrix(part, zeta)
+            # The momentum of a rotation is ω × s, with the first moment s of the mass.
+            moment = jnp.stack([matrix[1, 5], matrix[2, 3], matrix[0, 4]] if d == 3 else [matrix[1, 2], -matrix[0, 2]])
+            return energy - gravity @ (matrix[0, 0] * x[0, :d] + space.direction(x[0], moment))
+
+        return jnp.sum(self._map(single, poses))
 
 
 class CoordinateGroup(AbstractGroup):
@@ -353,11 +427,11 @@ class FrameGroup(AbstractGroup):
 
     def poses(self, t: Scalar, poses: BodyPoses) -> Float[Array, "parts p"]:
         """Prepared poses of the frames."""
-        return self._map(lambda at, x: at(t).pose(self._space, x[0]), poses)
+        return self._map(lambda at, x: at(t).pose(self._space, x[0], *at(t).modal(x)), poses)
 
     def velocities(self, now: Kinematics) -> Float[Array, "parts v"]:
         """Velocities of the frames."""
-        single = lambda at, x, v: at(now.t).velocity(self._space, x[0], v[0])
+        single = lambda at, x, v: at(now.t).velocity(self._space, x[0], v[0], *at(now.t).modal(x), *at(now.t).modal(v))
         return self._map(single, now.poses, now.velocities)
 
 

@@ -72,17 +72,19 @@ def extended_joint_order(system: Any, before: Any, order: JointOrder) -> JointOr
 def _joint_order(
     layout: Layout, groups: tuple[Any, ...], left_out: tuple[int, ...], absolute: frozenset[int]
 ) -> JointOrder:
-    ground, size = layout.ground, layout.space.velocity_size
+    ground, size = layout.ground, layout.mass_index.shape[1]
     parts = [(part_bodies, rows) for bodies, rows in groups for part_bodies in bodies]
-    joints = _merged(parts, ground)
-    rows, bodies_of, blocks = _indices(parts, joints, ground, size)
+    # A flexible body is one vertex of the graph, with its modal coordinates.
+    on_vertices = [(tuple(layout.mass_place(body)[0] for body in bodies), rows) for bodies, rows in parts]
+    joints = _merged(on_vertices, ground)
+    rows, bodies_of, blocks = _indices(parts, joints, layout)
     total = sum(rows for _, rows in parts)
     filled = rows < total
     place = np.empty(total, np.int32)
     place[rows[filled]] = np.flatnonzero(filled.ravel())
     kept = filled & ~np.isin(rows, np.array(left_out, int))
 
-    below = _hubs(joints, parts, absolute, ground)
+    below = _hubs(joints, on_vertices, absolute, ground)
     hubs = {hub: len(joints) + k for k, hub in enumerate(sorted(below))}
     of_body: dict[int, list[int]] = {}
     for joint, (bodies, _) in enumerate(joints):
@@ -99,8 +101,8 @@ def _joint_order(
         bodies=bodies_of,
         blocks=blocks,
         on_bodies=placed_sums(bodies_of.reshape(-1), ground),
-        velocity_index=layout.velocity_index,
-        velocity_place=layout.velocity_place,
+        velocity_index=layout.mass_index,
+        velocity_place=_places(layout.mass_index, layout.nu),
         first=first,
         second=second,
         products=placed_sums(products, nodes.blocks),
@@ -114,15 +116,23 @@ def _joint_order(
     return dataclasses.replace(order, key=digest_of_fields(order))
 
 
-def _indices(parts, joints, ground, size):
+def _places(index, count):
+    """The index of each of `count` velocities among the raveled entries of `index`."""
+    places = np.zeros(count + 1, np.int32)
+    places[index[:-1].ravel()] = np.arange(index[:-1].size)
+    return places[:-1]
+
+
+def _indices(parts, joints, layout):
     """Rows, bodies and entries of the blocks of each joint, padded to the largest joint."""
+    ground, size = layout.ground, layout.space.velocity_size
     first_row = [0, *itertools.accumulate(rows for _, rows in parts)]
     first_entry = [0, *itertools.accumulate(rows * len(bodies) * size for bodies, rows in parts)]
     widest = max(sum(parts[p][1] for p in numbers) for _, numbers in joints)
     most = max(len(bodies) for bodies, _ in joints)
     rows = np.full((len(joints), widest), first_row[-1], np.int32)
     bodies_of = np.full((len(joints), most), ground, np.int32)
-    blocks = np.full((len(joints), most, widest, size), first_entry[-1], np.int32)
+    blocks = np.full((len(joints), most, widest, layout.mass_index.shape[1]), first_entry[-1], np.int32)
     for joint, (bodies, numbers) in enumerate(joints):
         bodies_of[joint, : len(bodies)] = bodies
         start = 0
@@ -131,8 +141,11 @@ def _indices(parts, joints, ground, size):
             rows[joint, start : start + n] = np.arange(first_row[p], first_row[p + 1])
             entries = np.arange(first_entry[p], first_entry[p + 1]).reshape(n, len(part_bodies), size)
             for k, body in enumerate(part_bodies):
-                if body != ground:
-                    blocks[joint, bodies.index(body), start : start + n] = entries[:, k]
+                vertex, column = layout.mass_place(body)
+                if vertex != ground:
+                    columns = slice(0, size) if vertex == body else slice(column, column + 1)
+                    of_vertex = blocks[joint, bodies.index(vertex), start : start + n]
+                    of_vertex[:, columns] = entries[:, k, : columns.stop - columns.start]
             start += n
     return rows, bodies_of, blocks
 

@@ -15,12 +15,14 @@ class Layout:
     """Bodies in order, each with contiguous entries in q and u; then scalar coordinates; then the ground.
 
     A body that does not rotate (a point mass) has translations only; the rest of its pose is constant. A scalar
-    coordinate has only the first entry of a pose and, if it moves, the first entry of a velocity.
+    coordinate has only the first entry of a pose and, if it moves, the first entry of a velocity. `flexible` lists, for
+    each body with modal coordinates, its index and those of the modal coordinates.
     """
 
     space: AbstractSpace
     rotates: tuple[bool, ...]
     scalars: tuple[ScalarCoordinate, ...] = ()
+    flexible: tuple[tuple[int, ...], ...] = ()
 
     @property
     def bodies(self) -> int:
@@ -85,6 +87,30 @@ class Layout:
     def velocity_place(self) -> np.ndarray:
         """Index of each velocity among all bodies' velocities, body by body, shape (nu,)."""
         return np.flatnonzero(self.velocity_index[:-1].ravel() < self.nu).astype(np.int32)
+
+    @functools.cached_property
+    def mass_index(self) -> np.ndarray:
+        """As `velocity_index`, for the bodies and scalar coordinates that inertia does not couple: a flexible body has
+        its modal coordinates' velocities after its own, and these coordinates have none.
+        """
+        if not self.flexible:
+            return self.velocity_index
+        size = self.space.velocity_size
+        out = np.full((self.ground + 1, size + max(map(len, self.flexible)) - 1), self.nu, np.int32)
+        out[:, :size] = self.velocity_index
+        for mode, place in self._mass_places.items():
+            out[place] = self.velocity_index[mode, 0]
+            out[mode] = self.nu
+        return out
+
+    def mass_place(self, number: int) -> tuple[int, int]:
+        """The row and the column of `mass_index` at which the velocities of a body or scalar coordinate begin."""
+        return self._mass_places.get(number, (number, 0))
+
+    @functools.cached_property
+    def _mass_places(self) -> dict[int, tuple[int, int]]:
+        size = self.space.velocity_size
+        return {mode: (body, size + k) for body, *modes in self.flexible for k, mode in enumerate(modes)}
 
     @functools.cached_property
     def coordinate_place(self) -> np.ndarray:

@@ -29,7 +29,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
     ]
     parts: dict[str, Anchors] = {}
     for name, bodies, part in single:
-        points = [part.anchor(k) for k in range(len(bodies))]
+        points = [part.anchor(space, k) for k in range(len(bodies))]
         parts.setdefault(
             name, Anchors(bodies, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
         )
@@ -63,7 +63,8 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
 def _pictured(group):
     """The parts as a picture shows them; parts on the ground keep their given places."""
     moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
-    on_ground = group.body_index[:, -1] == group.layout.ground
+    last = np.flatnonzero(group.layout.is_place(group.bodies[0]))[-1]
+    on_ground = group.body_index[:, last] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
     return eqx.tree_at(lambda stacked: stacked.part, group, jax.tree.map(kept, group.part, moved))
 
@@ -72,8 +73,7 @@ def _shapes(part, space, width):
     """The shapes of a part in the frames of their bodies, each with the index of its body within the part."""
     for k, shape in part.shapes(space, width):
         frame = part.body_frames.get(str(k))
-        rest = np.asarray(space.ground)
-        yield k, shape if frame is None else shape.moved(*space.placement(frame.pose(space, rest)))
+        yield k, shape if frame is None else shape.moved(*space.placement(frame.pose_in_body(space)))
 
 
 def _centres(group):

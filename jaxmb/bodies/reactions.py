@@ -230,8 +230,9 @@ def _with_slip(stick, laws, places, now, wrenches) -> Reaction:
 def _on_last_body(alone: Group, place: Place, poses: Any, wrenches: Any) -> tuple[Array, Array]:
     """Force and moment on the last moving body, for the part of a group of one."""
     space, last = alone.layout.space, place.last
-    pose, wrench = alone.gather(poses)[0, last], wrenches[last]
-    point = jax.tree.map(lambda leaf: leaf[0], alone.part).anchor(last)
+    poses = alone.gather(poses)[0]
+    pose, wrench = poses[last], wrenches[last]
+    point = jax.tree.map(lambda leaf: leaf[0], alone.part).anchor(space, last, poses)
     if space.dimension == 2:
         force, moment = wrench[:2], wrench[2]
         if point is not None:

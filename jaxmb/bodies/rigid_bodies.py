@@ -193,17 +193,17 @@ class RigidBodySystem(AbstractSystem):
     def inertia(self, t, q, u):
         if self.mass_matrix is not None:
             return self.mass_matrix
-        return self.bodies.inertia(self.constraints.scalar_inertias)
+        return self.bodies.inertia(q, self.constraints.scalar_inertias)
 
     @eqx.filter_jit
     def kinetic_energy(self, t, q, u):
         return 0.5 * jnp.dot(u, self.inertia(t, q, u).product(u))
 
     def linear_momentum(self, q, u):
-        return self.bodies.linear_momentum(u)
+        return self.bodies.linear_momentum(self.inertia(0.0, q, u).product(u))
 
     def angular_momentum(self, q, u):
-        return self.bodies.angular_momentum(q, u)
+        return self.bodies.angular_momentum(q, self.inertia(0.0, q, u).product(u))
 
     def coordinate_scale(self):
         return jnp.where(self.layout.coordinate_lengths, lax.stop_gradient(self.length), 1.0)
@@ -234,8 +234,7 @@ class RigidBodySystem(AbstractSystem):
         return self._with_gravity(self.forces.energy_in_motion(self.kinematics(t, q, u)), q)
 
     def _with_gravity(self, energy, q):
-        gravity = self.forces.gravity
-        return energy if gravity is None else energy + self.bodies.potential_energy(q, gravity)
+        return sum(self.bodies.potential_energy(q, self.forces.gravity), start=energy)
 
     @property
     def state_ends(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -379,8 +378,8 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared(self):
         mass = self.mass_matrix
-        if mass is None:
-            mass = self.bodies.inertia(self.constraints.scalar_inertias)
+        if mass is None and not self.layout.flexible:
+            mass = self.bodies.inertia(self.guess.q, self.constraints.scalar_inertias)
             mass = mass.with_inverse(self.guess.u) if self.spatial and self.acceleration_rows else mass
         return dataclasses.replace(self, constraints=self.constraints.prepared(), mass_matrix=mass)
 
@@ -423,7 +422,7 @@ class RigidBodySystem(AbstractSystem):
     @property
     def implicit_in_blocks(self) -> bool:
         in_blocks = self.elimination is not None or self.acceleration_rows == 0
-        plain = self.ideal_on_velocities and self.has_field_jacobian
+        plain = self.ideal_on_velocities and self.has_field_jacobian and not self.layout.flexible
         return plain and in_blocks and self.nu >= _LEAST_VELOCITIES
 
     def field_jacobian(self, t, y):

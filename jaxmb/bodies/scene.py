@@ -24,6 +24,7 @@ from ..parts.base import (
     AbstractBody,
     AbstractCompound,
     AbstractConstraint,
+    AbstractFlexibleBody,
     AbstractForce,
     AbstractLink,
     AbstractNonIdeal,
@@ -33,7 +34,7 @@ from ..parts.base import (
     KnownParts,
     rows_of,
 )
-from ..parts.boundary import captured, check_kernels
+from ..parts.boundary import captured, check_kernels, check_returns
 from ..parts.combinations import JointCoupling
 from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of, warn_of_angles
@@ -54,6 +55,7 @@ from .force_set import ForceSet
 from .groups import (
     BodyGroup,
     CoordinateGroup,
+    FlexibleGroup,
     ForceGroup,
     FrameGroup,
     NonIdealGroup,
@@ -187,6 +189,7 @@ def as_given(scene: Scene) -> RigidBodySystem:
             raise ValueError(f"{part.label} has a number that JAX traces. {_TRACED}")
     for body in scene.bodies:
         _call(body, "check")
+        _check_inertia(body)
     for part in (*scene.bodies, *scene.frames):
         warn_of_angles(part, part, stacklevel=_USER)
     space = SPACE if scene.bodies[0].dimension == 3 else PLANE
@@ -222,7 +225,7 @@ def as_given(scene: Scene) -> RigidBodySystem:
     )
     system = RigidBodySystem(
         bodies=BodySet(
-            groups=tuple(map(BodyGroup, stack([(body, (k,)) for k, body in enumerate(scene.bodies)], layout))),
+            groups=_body_groups(scene, layout, of_parts),
             tendons=tuple(map(CoordinateGroup, kind(AbstractTendon, None))),
             names=tuple(body.name for body in scene.bodies),
             layout=layout,
@@ -235,7 +238,7 @@ def as_given(scene: Scene) -> RigidBodySystem:
             layout=layout,
         ),
         forces=forces.with_states(None),
-        frames=tuple(map(FrameGroup, stack([(frames[f.name], (index[f.name],)) for f in scene.frames], layout))),
+        frames=tuple(map(FrameGroup, stack([_observed(frame.name, resolved) for frame in scene.frames], layout))),
         free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
         guess=dataclasses.replace(guess, z=forces.initial_states()),
         length=_length([inner for part, _ in parts for inner in (part, *_inner(part))], guess, layout),
@@ -250,11 +253,53 @@ def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int],
     """The layout; indices of bodies and ground by name; indices of the scalar coordinates of parts by name."""
     joints = {part.name: part for part in scene.joints}
     links = [part for part in (*scene.joints, *scene.forces) if isinstance(part, AbstractLink)]
-    scalars = {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
-    layout = Layout(space, tuple(body.rotates for body in scene.bodies), sum(scalars.values(), ()))
+    flexible = [(k, body) for k, body in enumerate(scene.bodies) if isinstance(body, AbstractFlexibleBody)]
+    scalars = {body.name: _call(body, "scalar_coordinates") for _, body in flexible}
+    scalars |= {part.name: _call(part, "scalar_coordinates", space, joints) for part in links}
+    numbers = itertools.count(len(scene.bodies))
+    of_parts = {name: tuple(itertools.islice(numbers, len(of_part))) for name, of_part in scalars.items()}
+    coupled = tuple((k, *of_parts[body.name]) for k, body in flexible)
+    layout = Layout(space, tuple(body.rotates for body in scene.bodies), sum(scalars.values(), ()), coupled)
     index = {body.name: k for k, body in enumerate(scene.bodies)} | {GROUND: layout.ground}
-    numbers = iter(range(layout.bodies, layout.ground))
-    return layout, index, {name: tuple(itertools.islice(numbers, len(of_part))) for name, of_part in scalars.items()}
+    return layout, index, of_parts
+
+
+def _body_groups(scene: Scene, layout: Layout, of_parts: Mapping[str, tuple[int, ...]]) -> tuple[BodyGroup, ...]:
+    """The stacked bodies, each with its modal coordinates."""
+    groups = stack([(body, (k, *of_parts.get(body.name, ()))) for k, body in enumerate(scene.bodies)], layout)
+    kind = lambda group: FlexibleGroup if isinstance(group.part, AbstractFlexibleBody) else BodyGroup
+    return tuple(kind(group)(group) for group in groups)
+
+
+def _observed(name: str, known: KnownParts) -> tuple[AbstractFrame, tuple[int, ...]]:
+    """A frame with the indices of its body, and of the modal coordinates with which it moves."""
+    frame, bodies = known.frames[name], (known.numbers[name], *known.modal(known.frames[name]))
+    return (frame.with_fields(rows=(1, len(bodies))) if len(bodies) > 1 else frame), bodies
+
+
+@on_host
+def _mass_matrix(body, space, zeta):
+    return body.mass_matrix(space, zeta)
+
+
+def _check_inertia(body: AbstractBody):
+    """Refuse a flexible body whose mass matrix is not one."""
+    if not isinstance(body, AbstractFlexibleBody):
+        return
+    space, k = SPACE if body.dimension == 3 else PLANE, len(body.modes)
+    zeta, size = np.zeros(k), space.velocity_size + k
+    with traced_by_jax(body.label, "an argument"):
+        check_returns(body.label, "mass_matrix", (size, size), lambda zeta: body.mass_matrix(space, zeta), zeta)
+        matrix = np.asarray(_mass_matrix(anonymous(body), space, jnp.asarray(zeta)))
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=1e-12 * np.max(np.abs(matrix))):
+        raise ValueError(f"{body.label}: mass_matrix must be symmetric, and is not at zero modal coordinates.")
+    if not np.min(np.linalg.eigvalsh(matrix)) > 0:
+        raise ValueError(f"{body.label}: mass_matrix must be positive definite, and is not at zero modal coordinates.")
+    if not np.allclose(np.diag(matrix)[: space.dimension], body.mass, rtol=1e-9):
+        raise ValueError(
+            f"{body.label}: mass_matrix has the masses {np.diag(matrix)[: space.dimension]} on the velocity of the "
+            f"frame, and mass is {float(body.mass)}; both are the whole mass."
+        )
 
 
 def _given_state(scene: Scene, layout: Layout) -> State:
@@ -425,7 +470,7 @@ def _check_rotation(part, components, bodies, layout, poses):
     space = layout.space
     for component in components if points else ():
         with traced_by_jax(part.label, "an argument"):
-            now, kernels, _ = captured(anonymous(_loaded(component)), space, len(bodies))
+            now, kernels, _ = captured(anonymous(_loaded(component)), space, len(bodies) - component.modal_rows)
             turned = _turned(now, space, poses, tuple(kernels.items()))
         if np.any(turned[points]):
             raise ValueError(

@@ -107,6 +107,38 @@ class BlockInertia(AbstractInertia):
         return BlockInertia(self.mass, self.inertia.swapaxes(1, 2))
 
 
+class CoupledInertia(AbstractInertia):
+    """A mass matrix of which groups of blocks, each on velocities of its own, are full matrices.
+
+    **Fields:** `rest`: the matrix of the other velocities, of size n; `blocks` (b, w, w) of each group; `index`, for
+    each group the indices of the blocks' velocities (b, w).
+    """
+
+    rest: AbstractInertia
+    blocks: tuple[Float[Array, "b w w"], ...]
+    index: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
+
+    def _apply(self, out, of_block, v):
+        for blocks, index in zip(self.blocks, self.index, strict=True):
+            place = np.array(index)
+            columns = unchecked_take(v.reshape(v.shape[0], -1), place)
+            values = jax.vmap(of_block)(blocks, columns).reshape(*place.shape, *v.shape[1:])
+            out = out.at[place].set(values, unique_indices=True, mode="promise_in_bounds")
+        return out
+
+    def product(self, v):
+        return self._apply(self.rest.product(v), lambda M, x: M @ x, v)
+
+    def solve(self, f):
+        return self._apply(self.rest.solve(f), solve_positive, f)
+
+    def root(self):
+        return CoupledInertia(self.rest.root(), tuple(jax.vmap(cholesky)(M) for M in self.blocks), self.index)
+
+    def transpose(self):
+        return CoupledInertia(self.rest.transpose(), tuple(M.swapaxes(1, 2) for M in self.blocks), self.index)
+
+
 class DenseInertia(AbstractInertia):
     """A full matrix, shape (n, n)."""
 

@@ -41,6 +41,8 @@ from .base import (
     AbstractPointPair as AbstractPointPair,
     AbstractAxisJoint as AbstractAxisJoint,
     AbstractBody as AbstractBody,
+    AbstractFlexibleBody as AbstractFlexibleBody,
+    ScalarCoordinate as ScalarCoordinate,
     AbstractConstraint as AbstractConstraint,
     AbstractVelocityConstraint as AbstractVelocityConstraint,
     AbstractJoint as AbstractJoint,
@@ -51,6 +53,7 @@ from .base import (
     AbstractNonIdeal as AbstractNonIdeal,
     AbstractTendon as AbstractTendon,
 )
+from .frames import AbstractFixedFrame as AbstractFixedFrame, AbstractFlexibleFrame as AbstractFlexibleFrame
 from .unilateral import (
     AbstractRigidContact as AbstractRigidContact,
     AbstractGeometricContact as AbstractGeometricContact,

@@ -49,10 +49,11 @@ Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
 
 class ScalarCoordinate(NamedTuple):
-    """A scalar coordinate that a part adds to the scene, `"rotor.angle"`.
+    """A scalar coordinate that a part adds to the scene, `"rotor.angle"`, or a modal coordinate of a flexible body.
 
     **Fields:** `is_length`: a length [m], otherwise an angle [rad]; `moves`: whether it has a velocity, and so an
-    inertia. Without a velocity it only counts the turns of an angle that is known up to full turns.
+    inertia, as modal coordinates do. Without a velocity it only counts the turns of an angle that is known up to full
+    turns.
     """
 
     name: str
@@ -64,9 +65,9 @@ class KnownParts(NamedTuple):
     """Parts already resolved; the remaining parts are resolved from these.
 
     **Fields:** the `space`; `numbers`: the index of a body, by its name or the name of a frame in it; `scalars`: the
-    indices of scalar coordinates, by the name of their part; `frames` by name; `observed`: the frames that the scene
-    names; the given `poses` of all bodies and scalar coordinates; the `joints` by name, each with the indices of its
-    bodies.
+    indices of scalar coordinates, by the name of their part or flexible body; `frames` by name; `observed`: the frames
+    that the scene names; the given `poses` of all bodies and scalar coordinates; the `joints` by name, each with the
+    indices of its bodies.
     """
 
     space: AbstractSpace
@@ -81,7 +82,12 @@ class KnownParts(NamedTuple):
         """The joint, the frame, or None for a body, with the indices of its bodies."""
         if name in self.joints:
             return self.joints[name]
-        return self.frames[name] if name in self.observed else None, (self.numbers[name],)
+        frame = self.frames[name] if name in self.observed else None
+        return frame, (self.numbers[name], *(() if frame is None else self.modal(frame)))
+
+    def modal(self, frame: Any) -> tuple[int, ...]:
+        """The indices of the modal coordinates that a frame moves with."""
+        return self.scalars[frame.of_body] if frame.is_flexible else ()
 
 
 class AbstractPart(eqx.Module):
@@ -105,6 +111,13 @@ class AbstractPart(eqx.Module):
     def kind(self) -> str:
         """The type of the part, for descriptions and error messages."""
         return type(self).__name__
+
+    @property
+    def modal_rows(self) -> int:
+        """The number of modal coordinates with which frames move that the part names. They stand between its bodies
+        and its scalar coordinates, and its kernels do not see them.
+        """
+        return 0
 
     @property
     def label(self) -> str:
@@ -214,6 +227,73 @@ class AbstractBody(AbstractPart):
         """
 
 
+class AbstractFlexibleBody(AbstractBody):
+    """A body whose points move in its frame with modal coordinates ζ, which have names and are coordinates of the
+    scene, `"rod.bend"`.
+
+    ```python
+    # A body with a bob on a spring, which slides along the body's x axis.
+    class Slider(planar.AbstractRigidBody, jaxmb.parts.AbstractFlexibleBody):
+        mass: jaxmb.parts.Number = jaxmb.parts.parameter(unit="kg", sign="positive")
+        inertia: jaxmb.parts.Number = jaxmb.parts.parameter(unit="kg m²", sign="positive")
+        bob: jaxmb.parts.Number = jaxmb.parts.parameter(unit="kg", sign="positive")
+        stiffness: jaxmb.parts.Number = jaxmb.parts.parameter(unit="N/m", sign="positive")
+        modes = (jaxmb.parts.ScalarCoordinate("slide", is_length=True, moves=True),)
+
+        def mass_matrix(self, space, zeta):
+            case, nothing = self.mass - self.bob, jnp.zeros_like(self.bob)
+            # The velocity of the bob by those of the frame and by the rate of ζ.
+            along = jnp.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0]]).at[1, 2].set(zeta[0])
+            return jnp.diag(jnp.stack([case, case, self.inertia, nothing])) + self.bob * along.T @ along
+
+        def energy(self, space, zeta):
+            return 0.5 * self.stiffness * zeta[0] ** 2
+
+    box = Slider("box", mass=1.0, inertia=0.1, bob=0.3, stiffness=50.0)
+    system = jaxmb.Scene([box]).compile()
+    state = jaxmb.assemble(system, fix={"box.slide": 0.1})
+    ```
+
+    It moves by its kinetic energy `½ wᵀ M(ζ) w`, where w holds the velocity of the frame's origin [m/s] and the angular
+    velocity [rad/s], both in body axes, and ζ̇. Gravity and all inertia forces follow from M. Frames of a class derived
+    from `AbstractFlexibleFrame` move with ζ; parts that name the body itself, or another frame, see the rigid frame.
+
+    **Fields:** `modes`: names within the body, and kinds, of the modal coordinates. `mass` is the whole mass, and
+    `inertia` the undeformed body's about the frame's origin, for pictures; the origin need not be the mass centre.
+    """
+
+    modes: AbstractVar[tuple[ScalarCoordinate, ...]]
+
+    @abc.abstractmethod
+    def mass_matrix(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> Float[Array, "n n"]:
+        """M(ζ) for the velocities w: 3 + k rows in the plane, 6 + k in space."""
+
+    def energy(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> Float[Array, ""]:
+        """Hook: the elastic energy [J]."""
+        del space
+        return jnp.zeros((), zeta.dtype)
+
+    def internal_force(
+        self, space: AbstractSpace, zeta: Float[Array, "k"], rates: Float[Array, "k"]
+    ) -> Float[Array, "k"]:
+        """Hook: generalized forces along ζ that no energy stores, such as damping."""
+        del space, rates
+        return jnp.zeros_like(zeta)
+
+    def scalar_coordinates(self) -> tuple[ScalarCoordinate, ...]:
+        """The modal coordinates by their names in the scene."""
+        return tuple(mode._replace(name=f"{self.name}.{mode.name}") for mode in self.modes)
+
+    def check(self, dimension: int | None = None) -> None:
+        super().check(dimension)
+        names = [mode.name for mode in self.modes]
+        wrong = [name for name in names if not name.isidentifier() or names.count(name) > 1]
+        if wrong or not names:
+            raise ValueError(f"{self.label}: modes need one name each, an identifier such as 'bend', got {names}.")
+        if still := [mode.name for mode in self.modes if not mode.moves]:
+            raise ValueError(f"{self.label}: modal coordinates move; declare moves=True for {', '.join(still)}.")
+
+
 class _Bodies:
     """`part.bodies`: the values of the body-name fields, in order; a field named `bodies` overrides it."""
 
@@ -283,20 +363,50 @@ class AbstractActor(AbstractPart):
 
     def seen_poses(self, space: AbstractSpace, poses: Poses) -> Poses:
         """The poses that the kernels see, from poses of the bodies."""
-        return type(self)._on_frames(self, lambda frame, x: frame.pose(space, x), poses)
+        of_frame = lambda frame, x: frame.pose(space, x, *frame.modal(poses))
+        return type(self)._on_frames(self, of_frame, self._of_bodies(poses))
 
     def seen(self, space: AbstractSpace, poses: Poses, velocities: Velocities) -> tuple[Poses, Velocities]:
         """The poses and velocities that the kernels see, from poses and velocities of the bodies."""
-        seen = self._on_frames(lambda frame, x, v: frame.velocity(space, x, v), poses, velocities)
+        of_frame = lambda frame, x, v: frame.velocity(space, x, v, *frame.modal(poses), *frame.modal(velocities))
+        seen = self._on_frames(of_frame, self._of_bodies(poses), self._of_bodies(velocities))
         return self.seen_poses(space, poses), seen
 
     def seen_wrenches(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
         """The wrenches that the kernels see, from wrenches on the bodies."""
-        return self._on_frames(lambda frame, x, w: frame.wrench_on_frame(space, x, w), poses, wrenches)
+        of_frame = lambda frame, x, w: frame.wrench_on_frame(space, x, w, *frame.modal(poses))
+        return self._on_frames(of_frame, self._of_bodies(poses), self._of_bodies(wrenches))
 
     def wrenches_on_bodies(self, space: AbstractSpace, poses: Poses, wrenches: Wrenches) -> Wrenches:
         """The wrenches on the bodies that are equivalent to the kernels' wrenches."""
-        return self._on_frames(lambda frame, x, w: frame.wrench(space, x, w), poses, wrenches)
+        of_frame = lambda frame, x, w: frame.wrench(space, x, w, *frame.modal(poses))
+        out = self._on_frames(of_frame, self._of_bodies(poses), wrenches)
+        if not self.modal_rows:
+            return out
+        start, end = self._modal_span
+        out = jnp.insert(out, np.full(end - start, start), 0.0, axis=0)
+        for k, frame in self.body_frames.items():
+            for zeta in frame.modal(poses):
+                out = out.at[slice(*frame.rows), 0].add(frame.modal_force(space, poses[int(k)], wrenches[int(k)], zeta))
+        return out
+
+    @property
+    def modal_rows(self) -> int:
+        start, end = self._modal_span
+        return end - start
+
+    @property
+    def _modal_span(self) -> tuple[int, int]:
+        """Where the modal coordinates of all its frames begin and end among its bodies."""
+        spans = [frame.rows for frame in self.body_frames.values() if frame.rows[1]]
+        return (min(start for start, _ in spans), max(end for _, end in spans)) if spans else (0, 0)
+
+    def _of_bodies(self, rows: Any) -> Any:
+        """The rows without those of modal coordinates."""
+        start, end = self._modal_span
+        if not end:
+            return rows
+        return rows[:start] if end == len(rows) else namespace(rows).concatenate([rows[:start], rows[end:]])
 
     def _on_frames(self, of_frame: Callable[..., Any], *rows: Any) -> Any:
         """The last array; `of_frame(frame, …)` of its rows in all arrays replaces a row of a body with a frame."""
@@ -306,6 +416,21 @@ class AbstractActor(AbstractPart):
         numbered = enumerate(zip(*rows, strict=True))
         out = [of_frame(frames[str(k)], *row) if str(k) in frames else row[-1] for k, row in numbered]
         return namespace(*out).stack(out)
+
+    def placed(self, known: KnownParts, names: Sequence[str]) -> tuple[Self, tuple[int, ...]]:
+        """A copy with the frames among the bodies that it names, and the indices of these bodies and of the modal
+        coordinates with which the frames move.
+        """
+        frames, numbers = {}, [known.numbers[name] for name in names]
+        for k, name in enumerate(names):
+            if name not in known.frames:
+                continue
+            frame, modal = known.frames[name], known.modal(known.frames[name])
+            if modal and modal[0] not in numbers:
+                numbers += modal
+            first = numbers.index(modal[0]) if modal else 0
+            frames[str(k)] = frame.with_fields(rows=(first, first + len(modal))) if modal else frame
+        return type(self).with_fields(self, body_frames=frames), tuple(numbers)
 
 
 class AbstractLink(AbstractActor):
@@ -420,10 +545,9 @@ class AbstractLink(AbstractActor):
         moving = [k for k in cls.distinct(numbers) if k != known.numbers[GROUND]]
         if len({*moving}) < len(moving):
             raise ValueError(f"{self.label} connects two frames of one body: {', '.join(names)}.")
-        frames = {str(k): known.frames[name] for k, name in enumerate(names) if name in known.frames}
-        part = cls.with_fields(self, body_frames=frames)
-        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(numbers)]))
-        return part, (*numbers, *known.scalars.get(self.name, ()))
+        part, bodies = cls.placed(self, known, names)
+        part = cls.resolve(part, known.space, cls.seen_poses(part, known.space, known.poses[list(bodies)]))
+        return part, (*bodies, *known.scalars.get(self.name, ()))
 
     def components(self) -> tuple["AbstractLink", ...]:
         """Hook: the component parts, by default itself; called after the numbers have been filled in."""
@@ -440,13 +564,18 @@ class AbstractLink(AbstractActor):
         del space, parts
         return ()
 
-    def anchor(self, k: int) -> Array | None:
-        """The part's point [m] on its k-th body, in that body's frame; None if it has none."""
+    def anchor(self, space: AbstractSpace, k: int, poses: Poses | None = None) -> Array | None:
+        """The part's point [m] on its k-th body, in that body's axes; None if it has none.
+
+        **Arguments:** `poses` of the part's bodies, for a point that moves in a flexible body; by default undeformed.
+        """
         for name, declaration in fields.declarations(type(self)).items():
             point = getattr(self, name) if declaration.is_point and declaration.body == k else None
             if point is not None:
                 frame = self.body_frames.get(str(k))
-                return point if frame is None else frame.point(point)
+                if frame is None:
+                    return point
+                return frame.point(space, point, *(() if poses is None else frame.modal(poses)))
         return None
 
     def pictured(self, space: AbstractSpace) -> Self:

@@ -21,6 +21,7 @@ from .base import (
     AbstractBody,
     AbstractConstraint,
     AbstractDynamicForce,
+    AbstractFlexibleBody,
     AbstractForce,
     AbstractLink,
     AbstractNonIdeal,
@@ -123,6 +124,10 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
     if isinstance(part, AbstractBody):
         yield "mass", (lambda part: part.mass, [])
         yield "inertia", (lambda part: part.inertia, [])
+    if isinstance(part, AbstractFlexibleBody):
+        zeta = np.zeros(len(part.modes), np.dtype(jnp.result_type(float)))
+        for name, given in (("mass_matrix", [zeta]), ("energy", [zeta]), ("internal_force", [zeta, zeta])):
+            yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     for name, _, given in _kernels(part, space, bodies):
         yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):

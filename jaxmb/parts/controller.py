@@ -215,10 +215,11 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
         return rate_of(space, self, coordinate, poses, velocities)[1]
 
     def _of_body(self, space, poses, velocities, source, quantity):
-        (k,), frame, d = self.places[int(source)], self.joints.get(source), space.dimension
+        (k, *modal), frame, d = self.places[int(source)], self.joints.get(source), space.dimension
         pose, velocity = poses[k], velocities[k]
         if isinstance(frame, AbstractFrame):
-            pose, velocity = frame.pose(space, pose), frame.velocity(space, pose, velocity)
+            zeta, rates = ([rows[np.array(modal), 0]] if modal else [] for rows in (poses, velocities))
+            pose, velocity = frame.pose(space, pose, *zeta), frame.velocity(space, pose, velocity, *zeta, *rates)
         return {
             "position": pose[:d],
             "velocity": velocity[:d],

@@ -316,7 +316,7 @@ class DryFriction(AbstractDryFriction):
             raise ValueError(f"{self.label}: friction in {held.label} is given by its name, {self.joint_name!r}.")
         if space.dimension == 2:
             return self
-        normal = _normal_to(held, space, held.seen_poses(space, poses[: len(held.bodies)]))
+        normal = _normal_to(held, space, held.seen_poses(space, poses[: len(held.bodies) + held.modal_rows]))
         # The axis nearest to the normal.
         k = int(np.argmax(np.abs(normal)))
         return self.with_fields(pole=(k + 1) * int(np.sign(normal[k])))
@@ -348,7 +348,7 @@ class DryFriction(AbstractDryFriction):
         if isinstance(held, AbstractRigidContact):
             if self.drift is not None:
                 held = held.with_fields(drift=self.drift.joints["0"])
-            bodies = len(held.bodies)
+            bodies = len(held.bodies) + held.modal_rows
             return held.slip(space, *held.seen(space, poses[:bodies], velocities[:bodies]), self.pole)
         if self.drift is None and held.knows_rates:
             return self._lengths(held.rates_at(space, poses, velocities))

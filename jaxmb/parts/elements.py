@@ -11,8 +11,6 @@ P. E. Nikravesh, "Computer-Aided Analysis of Mechanical Systems", Prentice-Hall 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, Self, TypeAlias
 
-import numpy as np
-
 
 class Coincident(NamedTuple):
     """`d = 0`, a row for each dimension: the vector d from `point_a`, fixed in A, to `point_b`, fixed in B [m]."""
@@ -112,7 +110,7 @@ def on_bodies(part: Any, space: Any, elements: Iterable[Element]) -> tuple[Eleme
     frames = part.body_frames
     if not frames:
         return tuple(elements)
-    poses = [frames[k].pose(space, np.array(space.ground)) if k in frames else None for k in ("0", "1")]
+    poses = [frames[k].pose_in_body(space) if k in frames else None for k in ("0", "1")]
     point = lambda k, s: s if poses[k] is None else space.point(poses[k], s)
     direction = lambda k, v: v if v is None or poses[k] is None else space.direction(poses[k], v)
 

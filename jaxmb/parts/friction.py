@@ -58,7 +58,7 @@ class Friction(AbstractNonIdeal):
         k = poses.shape[0] - 1
         if k > 1:
             raise ValueError(f"{self.label}: {joint.name!r} connects more than two bodies; use NonIdeal.")
-        anchor = joint.anchor(k)
+        anchor = joint.anchor(space, k)
         part = self.filled(point=np.zeros(space.dimension) if anchor is None else anchor)
         part._check_slip(space, joint, poses)
         return part

@@ -16,7 +16,7 @@ from .._arguments import check_kind
 from .._printed import Printed
 from ..linalg.arrays import add_up, is_traced
 from ..linalg.jitted import jitted
-from ..linalg.rotations import cross, norm
+from ..linalg.rotations import norm
 from ..parts.base import AbstractTendon
 from ..parts.coordinate_parts import AbstractCoordinatePart
 from ..parts.names import unknown
@@ -297,15 +297,15 @@ def _along(systems, parts, number, ts, ys, solved):
         here = (with_parameters(system, sought) if sought else system).at(y)
         now = here.kinematics(t, y.q, y.u)
         wrenches = _wrenches(here, parts, now, multipliers)
-        points = [_point(here, entries, now.t) for entries in parts]
+        points = [_point(here, entries, now) for entries in parts]
         for k, group, member, row in acting:
             of_drive = _of_drive(machine, drives[k], number, Instant.of(here, t, y), given[k])
             if row is None:
                 wrenches.append(of_drive)
-                points.append(_point_of(group, member, number, now.t))
+                points.append(_point_of(group, member, number, now))
             else:
                 wrenches[row] += of_drive
-        own = _of_body(here, number, now, udot)
+        own = _of_body(here, number, now, y, udot)
         turns = [_in_body_axes(space, now.poses[number], wrench) for wrench in (*wrenches, *own)]
         forces, moments = (jnp.stack(x) for x in zip(*turns, strict=True))
         if not system.layout.rotates[number]:
@@ -323,16 +323,18 @@ def _of_drive(machine, drive: Drive, number: int, at: Instant, force) -> Array:
     return generalized[machine.layout.velocity_index[number]]
 
 
-def _point_of(group, member: int, number: int, t) -> Array | None:
+def _point_of(group, member: int, number: int, now) -> Array | None:
     """The point of a part on a body, in the axes at its mass centre; None without one."""
-    return None if group is None else _anchor(group.group.single(member, t), group.group.bodies[member].index(number))
+    return None if group is None else _anchor(group.group, member, group.group.bodies[member].index(number), now)
 
 
-def _anchor(part, place: int) -> Array | None:
+def _anchor(group, member: int, place: int, now) -> Array | None:
     """The point of a part, or of the joint on whose coordinate it acts, on a body."""
-    point = part.anchor(place)
+    part, space, poses = group.single(member, now.t), group.layout.space, now.poses[group.body_index[member]]
+    point = part.anchor(space, place, poses)
     if point is None and isinstance(part, AbstractCoordinatePart) and place in part.places[0]:
-        return part.joint.anchor(part.places[0].index(place))
+        at = part.places[0]
+        return part.joint.anchor(space, at.index(place), poses[np.array(at)])
     return point
 
 
@@ -357,7 +359,7 @@ def _wrenches(system, parts, now, multipliers) -> list[Array]:
     return [add_up(map(on_body, entries)) for entries in parts]
 
 
-def _point(system, entries, t) -> Array | None:
+def _point(system, entries, now) -> Array | None:
     """The point of a part on the body, in the axes at its mass centre; of friction the point of the joint."""
     sets = _sets(system)
     for of, number, member, place in entries:
@@ -367,21 +369,20 @@ def _point(system, entries, t) -> Array | None:
             joint = group.joints[member]
             holders = [(g, g.group.names.index(joint)) for g in sets["constraints"] if joint in g.group.names]
         for holder, k in holders:
-            point = _anchor(holder.group.single(k, t), place)
+            point = _anchor(holder.group, k, place, now)
             if point is not None:
                 return point
     return None
 
 
-def _of_body(system, number: int, now, udot) -> list[Array]:
+def _of_body(system, number: int, now, y, udot) -> list[Array]:
     """The wrenches of gravity, if any, and of inertia."""
-    mass, J, gravity = system.mass[number], system.moments_of_inertia[number], system.forces.gravity
-    space, d = system.layout.space, system.layout.space.dimension
-    rates = jnp.append(udot, jnp.zeros((), udot.dtype))[system.layout.velocity_index[number]]
-    turning, omega = rates[d:], now.velocities[number, d:]
-    moment = J * turning if d == 2 else J @ turning + cross(omega, J @ omega)
-    inertia = -jnp.concatenate([mass * rates[:d], moment])
-    return [inertia] if gravity is None else [jnp.pad(mass * gravity, (0, space.velocity_size - d)), inertia]
+    bodies, gravity = system.bodies, system.forces.gravity
+    on_body = lambda force: jnp.append(force, jnp.zeros((), force.dtype))[system.layout.velocity_index[number]]
+    total = lambda gravity: bodies.generalized_force(bodies.wrenches(now, gravity), udot)
+    without = total(None)
+    inertia = on_body(without - system.inertia(now.t, y.q, y.u).product(udot))
+    return [inertia] if gravity is None else [on_body(total(gravity) - without), inertia]
 
 
 def _in_body_axes(space, pose, wrench) -> tuple[Array, Array]:

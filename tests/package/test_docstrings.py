@@ -69,6 +69,7 @@ AFTER = {
     "Optimum": "optimise",
     "robust": "optimise",
     "Floquet": "floquet",
+    "parts.AbstractFlexibleFrame": "parts.AbstractFlexibleBody",
     "viz.plot_root_locus": "root_locus",
 }
 # What examples refer to besides.

@@ -104,7 +104,7 @@ def test_points_of_a_frame_are_fixed_in_its_body():
     frame, pose = planar.Frame("tip", "bar", position=(0.3, 0.1), angle=0.4), np.array([0.7, -0.2, 1.1])
     own, c, s = np.array([0.5, -0.6]), np.cos(0.4), np.sin(0.4)
     in_body = np.array([0.3 + c * own[0] - s * own[1], 0.1 + s * own[0] + c * own[1]])
-    np.testing.assert_allclose(frame.point(own), in_body, rtol=1e-14)
+    np.testing.assert_allclose(frame.point(PLANE, own), in_body, rtol=1e-14)
     np.testing.assert_allclose(PLANE.point(frame.pose(PLANE, pose), own), PLANE.point(pose, in_body), rtol=1e-14)
 
 

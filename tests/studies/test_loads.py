@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +92,8 @@ def test_inertia_of_a_body_in_space_has_gyroscopic_moments():
     J = np.array([[2.0, 0.1, 0.3], [0.1, 1.5, 0.2], [0.3, 0.2, 1.0]])
     system = mb.Scene([spatial.Body("top", mass=3.0, inertia=J)]).compile()
     u, udot = np.random.default_rng(0).normal(size=(2, 6))
-    (inertia,) = _of_body(system, 0, SimpleNamespace(velocities=u[None]), udot)
+    y = mb.State(system.guess.q, jnp.asarray(u))
+    (inertia,) = _of_body(system, 0, system.kinematics(0.0, y.q, y.u), y, jnp.asarray(udot))
     turning = J @ udot[3:] + np.cross(u[3:], J @ u[3:])
     np.testing.assert_allclose(inertia, -np.concatenate([3.0 * udot[:3], turning]), rtol=1e-13)
 

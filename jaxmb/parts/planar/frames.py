@@ -6,10 +6,10 @@ from ...linalg.arrays import namespace
 from ...linalg.rotations import rotate_2d
 from .. import fields
 from ..base import AbstractPlanarPart
-from ..frames import AbstractFrame
+from ..frames import AbstractFixedFrame
 
 
-class Frame(AbstractPlanarPart, AbstractFrame):
+class Frame(AbstractPlanarPart, AbstractFixedFrame):
     """A frame fixed in a body, or in another frame.
 
     ```python

@@ -6,10 +6,10 @@ from ...linalg.arrays import namespace
 from ...linalg.rotations import multiply, rotate, unrotate
 from .. import fields
 from ..base import AbstractSpatialPart
-from ..frames import AbstractFrame
+from ..frames import AbstractFixedFrame
 
 
-class Frame(AbstractSpatialPart, AbstractFrame):
+class Frame(AbstractSpatialPart, AbstractFixedFrame):
     """A frame fixed in a body, or in another frame.
 
     ```python
