@@ -47,8 +47,8 @@ FAULTS = [
     ),
     Fault(
         "parts/controller.py",
-        "frame.pose(space, pose), frame.velocity(space, pose, velocity)",
-        "frame.pose(space, pose), velocity",
+        "frame.pose(space, pose, *zeta), frame.velocity(space, pose, velocity, *zeta, *rates)",
+        "frame.pose(space, pose, *zeta), velocity",
     ),
     Fault(
         "parts/coordinate_parts.py",
@@ -764,7 +764,7 @@ FAULTS = [
     Fault("linalg/inertia.py", "self._apply(self.rest.solve(f), solve_positive, f)", "self.rest.solve(f)"),
     Fault("bodies/groups.py", "jnp.zeros(d, x.dtype), -turning, along", "jnp.zeros(d, x.dtype), turning, along"),
     Fault("bodies/groups.py", "turning + cross(w[3:6], momentum[3:6])", "turning - cross(w[3:6], momentum[3:6])"),
-    Fault("bodies/groups.py", "- kernel(\"energy\")(part, zeta)", "+ kernel(\"energy\")(part, zeta)"),
+    Fault("bodies/groups.py", '- kernel("energy")(part, zeta)', '+ kernel("energy")(part, zeta)'),
     Fault("bodies/groups.py", "return energy - gravity @ (matrix", "return energy + gravity @ (matrix"),
     Fault("parts/frames.py", "wrench[d:] - space.force_at(pose", "wrench[d:] + space.force_at(pose"),
     Fault("parts/frames.py", "zeta, rates), *rest)[1](wrench)", "0.0 * zeta, rates), *rest)[1](wrench)"),
