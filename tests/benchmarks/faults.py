@@ -492,7 +492,7 @@ FAULTS = [
         "return (height - 2 * self.radius * norm(self.normal))[None]",
     ),
     # Bodies and systems
-    Fault("bodies/body_set.py", "self.mass[:, None] * gravity[None, :]", "self.mass[:, None] * -gravity[None, :]"),
+    Fault("bodies/body_set.py", "mass[:, None] * gravity[None, :]", "mass[:, None] * -gravity[None, :]"),
     Fault(
         "bodies/body_set.py",
         "moment = -jax.vmap(lambda J, w: cross(w, J @ w))",
