@@ -499,7 +499,7 @@ FAULTS = [
         "moment = jax.vmap(lambda J, w: cross(w, J @ w))",
     ),
     Fault("bodies/body_set.py", "moment = lambda J, w: -cross(w, J @ w)", "moment = lambda J, w: cross(w, J @ w)"),
-    Fault("bodies/body_set.py", "rotate(p, J @ w))(poses[:, 3:]", "J @ rotate(p, w))(poses[:, 3:]"),
+    Fault("bodies/body_set.py", "jax.vmap(rotate)(poses[:, 3:], momenta[:, 3:])", "momenta[:, 3:]"),
     Fault(
         "bodies/elementary.py",
         "half = np.where(self.places.with_x, 1.0, 0.5)",
@@ -589,8 +589,8 @@ FAULTS = [
     ),
     Fault(
         "bodies/rigid_bodies.py",
-        "energy if gravity is None else energy + self",
-        "energy if gravity is None else energy - self",
+        "self.forces.gravity), start=energy)",
+        "self.forces.gravity), start=-energy)",
     ),
     Fault(
         "bodies/rigid_bodies.py",
@@ -937,7 +937,7 @@ FAULTS = [
         "return points + centre[None], forces, moments - jnp.cross(points, forces)",
         "return points + centre[None], forces, moments",
     ),
-    Fault("studies/loads.py", "J @ turning + cross(omega, J @ omega)", "J @ turning"),
+    Fault("studies/loads.py", "on_body(without - system", "on_body(0.0 * without - system"),
     Fault(
         "studies/loads.py",
         "arms = self.points - self.mass_centre[None, None]",
