@@ -9,7 +9,7 @@ import abc
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar, Velocities
@@ -78,11 +78,11 @@ def suitable_jacobian(at: Instant, formulation: AbstractFormulation) -> Abstract
     return at.structured_jacobian.selected(system.acceleration_rank, system.velocity_scale(), row_levels(system))
 
 
-def row_levels(system: AbstractEquation) -> Array:
+def row_levels(system: AbstractEquation) -> np.ndarray:
     """Levels for elimination: 0 for holonomic rows, 1 for nonholonomic rows, 2 for rows of accelerations only.
     `full_pivot` eliminates level 0 first, so that the dependent velocities nest.
     """
-    row = jnp.arange(system.acceleration_rows)
+    row = np.arange(system.acceleration_rows)
     return (row >= system.position_rows).astype(int) + (row >= system.velocity_rows).astype(int)
 
 

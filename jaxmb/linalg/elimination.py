@@ -11,6 +11,7 @@ Source: R. A. Wehage and E. J. Haug, "Generalized Coordinate Partitioning for Di
 Constrained Dynamic Systems", J. Mech. Design 104(1), 1982.
 """
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -99,6 +100,8 @@ def _for_matrix_jvp(primals, tangents):
     return factor, Factor(-(pushed @ factor.right_inverse), -(pushed @ factor.null_space), None)
 
 
+# A program has several searches and eliminations, and traces each once.
+@functools.partial(jax.jit, static_argnames="tol")
 def full_pivot(
     A: Float[Array, "m n"],
     *,
@@ -180,6 +183,7 @@ def _inverse(permutation: Int[Array, "n"]) -> Int[Array, "n"]:
     return jnp.sum(jnp.where(permutation[None, :] == index[:, None], index[None, :], 0), axis=1, dtype=np.int32)
 
 
+@functools.partial(jax.jit, static_argnames="rank")
 def eliminate(A: Float[Array, "m n"], order: PivotOrder, rank: int) -> Factor:
     """Eliminate in the order of a chart, without search; differentiable in `A`.
 

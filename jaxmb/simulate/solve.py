@@ -91,6 +91,7 @@ class WrappedAngles(eqx.Module):
 
     system: AbstractSystem
 
+    @eqx.filter_jit
     def __call__(self, t, y):
         along = jnp.ones_like(t), self.system.rates(t, y.q, y.u)
         return jax.jvp(self.system.wrapped_angles, (t, y.q), along)

@@ -228,6 +228,7 @@ class MultistepController(diffrax.AbstractAdaptiveStepSizeController[ControllerS
         dt0 = self._bound(dt0, t0.dtype)
         return t0 + dt0, ControllerState(lax.stop_gradient(dt0), jnp.array([0, 0, opening, 0, 0], np.int32))
 
+    @eqx.filter_jit
     def adapt_step_size(
         self,
         t0: Any,

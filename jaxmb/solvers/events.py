@@ -465,6 +465,7 @@ class EventController(AbstractControllerAround):
         start = jnp.array(True), jnp.asarray(jnp.inf, t0.dtype), jnp.array(False)
         return first, EventState(inner, *none, times, states, touch, jnp.array(0), *start)
 
+    @eqx.filter_jit
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error: Any, error_order, controller_state):
         before, crossing = controller_state, y_error
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
