@@ -613,6 +613,10 @@ class ForceGroup(AbstractGroup):
         """Tensions of the spans of ropes."""
         return self._of_motion("tension", now)
 
+    def measures(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
+        """Further quantities of a motion, by name within the part."""
+        return self._of_motion("measures", now)
+
     def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
         if not self.group.part.conservative:
             return jnp.zeros((), poses.dtype)

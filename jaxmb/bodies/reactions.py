@@ -55,7 +55,7 @@ def joint_places(constraints: ConstraintSet, name: str) -> tuple[tuple[Place, ..
 
 
 def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
-    """The forces and moments of joints, and the tensions of ropes."""
+    """The forces and moments of joints, the tensions of ropes, and the quantities of force elements."""
     d = system.layout.space.dimension
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
     joints = {name: joint_places(system.constraints, name) for name in names}
@@ -64,7 +64,7 @@ def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
         for name, joint in joints.items()
         for field, shape in fields.items()
     }
-    return of_joints | _tension_measures(system)
+    return of_joints | _tension_measures(system) | _force_measures(system)
 
 
 def _tension_measures(system) -> dict[str, Measure]:
@@ -78,6 +78,25 @@ def _tension_measures(system) -> dict[str, Measure]:
                 for k, name in enumerate(group.group.names):
                     out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
     return out
+
+
+def _force_measures(system) -> dict[str, Measure]:
+    """The quantities that force elements have, `"blade.section_force"`."""
+    guess, out = system.guess, {}
+    for g, group in enumerate(system.forces.groups):
+        at_guess = lambda group, q, u: group.measures(system.kinematics(jnp.zeros((), q.dtype), q, u))
+        for field, values in jax.eval_shape(at_guess, group, guess.q, guess.u).items():
+            for k, name in enumerate(group.group.names):
+                out[f"{name}.{field}"] = Measure(values.shape[1:], _of_force, (g, field, np.array(k)))
+    return out
+
+
+@view_of_motion
+def _of_force(system, place, ts, ys, solved):
+    del solved
+    number, field, member = place
+    alone = system.forces.groups[number].only(member)
+    return jax.vmap(lambda t, y: alone.measures(system.kinematics(t, y.q, y.u))[field][0])(ts, ys)
 
 
 def lifted_ropes(system: Any, motion: Any) -> list[str]:

@@ -632,6 +632,13 @@ class AbstractForce(AbstractLink):
     def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:
         """The wrench on each of its bodies."""
 
+    def measures(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
+    ) -> dict[str, Float[Array, "..."]]:
+        """Hook: quantities of a motion by their names within the part, such as section forces of a beam."""
+        del space, poses, velocities, t
+        return {}
+
     def gaps(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "gaps"]:
         """Hook: the gaps [m, rad] of a part that `has_gaps`, negative where the force acts. Each is a distance from a
         convex shape, or varies with a joint.

@@ -127,6 +127,9 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
+    if isinstance(part, AbstractForce):
+        measures = lambda part, *arguments: part.measures(space, *arguments)
+        yield "measures", (measures, [*_arguments(space, bodies)])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])
