@@ -609,10 +609,6 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
-    def tension(self, now: Kinematics) -> Float[Array, "parts spans"]:
-        """Tensions of the spans of ropes."""
-        return self._of_motion("tension", now)
-
     def measures(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
         """Further quantities of a motion, by name within the part."""
         return self._of_motion("measures", now)

@@ -69,14 +69,13 @@ def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
 
 def _tension_measures(system) -> dict[str, Measure]:
     out = {}
-    for of_forces, groups in ((True, system.constraints.groups), (False, system.forces.groups)):
-        for g, group in enumerate(groups):
-            if group.group.part.has_tension:
-                # Of a rope with friction, whose constraint comes first, each side of a pulley.
-                spans = group.group.part.sides
-                shape = () if spans == 1 else (spans,)
-                for k, name in enumerate(group.group.names):
-                    out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
+    for g, group in enumerate(system.constraints.groups):
+        if group.group.part.has_tension:
+            # Of a rope with friction, whose constraint comes first, each side of a pulley.
+            spans = group.group.part.sides
+            shape = () if spans == 1 else (spans,)
+            for k, name in enumerate(group.group.names):
+                out[f"{name}.tension"] = Measure(shape, _tension, (g, shape, np.array(k)), of_forces=True)
     return out
 
 
@@ -123,8 +122,8 @@ def lifted_ropes(system: Any, motion: Any) -> list[str]:
 
 @view_of_motion
 def _tension(system, place, ts, ys, solved):
-    group, of_rows, shape, member = place
-    if of_rows and not (friction := system.constraints.groups[group]).of_poses:
+    group, shape, member = place
+    if not (friction := system.constraints.groups[group]).of_poses:
 
         def with_friction(t, y, multipliers):
             now = system.kinematics(t, y.q, y.u)
@@ -132,12 +131,8 @@ def _tension(system, place, ts, ys, solved):
             return friction.law.tensions(now, reactions)[member]
 
         return jax.vmap(with_friction)(ts, ys, solved.multipliers)
-    if of_rows:
-        pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
-        return pulls(solved.multipliers).reshape(-1, *shape)
-    alone = system.forces.groups[group].only(member)
-    pull = lambda t, y: alone.tension(system.kinematics(t, y.q, y.u))[0].reshape(shape)
-    return jax.vmap(pull)(ts, ys)
+    pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
+    return pulls(solved.multipliers).reshape(-1, *shape)
 
 
 @view_of_motion

@@ -167,8 +167,8 @@ class BeamBending(AbstractElasticBeam):
 
 
 class InextensibleBeam(AbstractBeam, AbstractConstraint):
-    """A beam that bends and twists, and neither stretches nor shears. Rows: 2 in the plane and 3 in space, `length (Γ₀ −
-    Γ) = 0`.
+    """A beam that bends and twists, and neither stretches nor shears. Rows 2 in the plane, 3 in space: `length (Γ₀ − Γ)
+    = 0`.
 
     ```python
     wire = jaxmb.sections.Section(bending_stiffness=0.5)

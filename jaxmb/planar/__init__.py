@@ -37,6 +37,7 @@ from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torqu
 from ..parts.planar.torsion import TorsionalSpringDamper as TorsionalSpringDamper
 from ..parts.bushing import Bushing as Bushing
 from ..parts.beam import Beam as Beam
+from ..parts.beam_chain import beam_chain as beam_chain, BeamChain as BeamChain
 from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.friction import Friction as Friction

@@ -49,6 +49,7 @@ from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, Point
 from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
 from ..parts.bushing import Bushing as Bushing
 from ..parts.beam import Beam as Beam
+from ..parts.beam_chain import beam_chain as beam_chain, BeamChain as BeamChain
 from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.friction import Friction as Friction
 
