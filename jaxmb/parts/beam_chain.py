@@ -114,12 +114,14 @@ def _nodes(names, places, section, masses, y):
 
 def _attitudes(tangents, y):
     """Euler parameters of the nodes, each from the previous one by the shortest turn."""
-    x = np.eye(3)[0]
-    out = [shortest_turn(x, tangents[0])]
+    x: Any = np.eye(3)[0]
+    turn: Any = shortest_turn(x, tangents[0])
     if y is not None:
         z = np.cross(tangents[0], y)
         axes = np.stack([tangents[0], np.cross(z, tangents[0]), z], axis=1)
-        out = [np.asarray(rot.from_matrix(axes / np.linalg.norm(axes, axis=0)))]
+        turn = np.asarray(rot.from_matrix(axes / np.linalg.norm(axes, axis=0)))
+    out = [turn]
     for tangent in tangents[1:]:
-        out.append(rot.normalize(rot.multiply(shortest_turn(rot.rotate(out[-1], x), tangent), out[-1])))
+        turn = rot.normalize(rot.multiply(shortest_turn(rot.rotate(turn, x), tangent), turn))
+        out.append(turn)
     return out

@@ -176,7 +176,7 @@ def shortest_turn(start: Vector3, end: Vector3) -> Float[Array, "4"]:
     between opposite ones a half turn about the first of the `perpendiculars`.
     """
     size = rot.norm(end)
-    turn = np.append(size + start @ end, rot.cross(start, end))
+    turn: Any = np.append(size + start @ end, rot.cross(start, end))
     return rot.normalize(turn if turn[0] > 1e-12 * size else np.append(0.0, perpendiculars(start)[0]))
 
 
