@@ -609,9 +609,9 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
-    def measures(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
+    def observables(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
         """Further quantities of a motion, by name within the part."""
-        return self._of_motion("measures", now)
+        return self._of_motion("observables", now)
 
     def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
         if not self.group.part.conservative:

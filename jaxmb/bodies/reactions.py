@@ -83,7 +83,7 @@ def _force_measures(system) -> dict[str, Measure]:
     """The quantities that force elements have, `"blade.section_force"`."""
     guess, out = system.guess, {}
     for g, group in enumerate(system.forces.groups):
-        at_guess = lambda group, q, u: group.measures(system.kinematics(jnp.zeros((), q.dtype), q, u))
+        at_guess = lambda group, q, u: group.observables(system.kinematics(jnp.zeros((), q.dtype), q, u))
         for field, values in jax.eval_shape(at_guess, group, guess.q, guess.u).items():
             for k, name in enumerate(group.group.names):
                 out[f"{name}.{field}"] = Measure(values.shape[1:], _of_force, (g, field, np.array(k)))
@@ -95,7 +95,7 @@ def _of_force(system, place, ts, ys, solved):
     del solved
     number, field, member = place
     alone = system.forces.groups[number].only(member)
-    return jax.vmap(lambda t, y: alone.measures(system.kinematics(t, y.q, y.u))[field][0])(ts, ys)
+    return jax.vmap(lambda t, y: alone.observables(system.kinematics(t, y.q, y.u))[field][0])(ts, ys)
 
 
 def lifted_ropes(system: Any, motion: Any) -> list[str]:

@@ -321,7 +321,7 @@ class AbstractLink(AbstractActor):
     quantities: ClassVar[Quantities] = {}
     # Whether bodies touch each other, the ground or a road in it, as in a contact and a tyre.
     touches: ClassVar[bool] = False
-    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or among the `measures` of
+    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or among the `observables` of
     # a force.
     has_tension: ClassVar[bool] = False
     # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
@@ -632,7 +632,7 @@ class AbstractForce(AbstractLink):
     def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:
         """The wrench on each of its bodies."""
 
-    def measures(
+    def observables(
         self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
     ) -> dict[str, Float[Array, "..."]]:
         """Hook: quantities of a motion by their names within the part, such as section forces of a beam."""

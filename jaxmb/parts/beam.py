@@ -123,7 +123,7 @@ class AbstractElasticBeam(AbstractBeam, AbstractPotentialForce):
     def energy(self, space, poses, t):
         return 0.5 * self.length * jnp.sum(self._stiffness(space) * self._stored(space, poses) ** 2)
 
-    def measures(self, space, poses, velocities, t):
+    def observables(self, space, poses, velocities, t):
         d = space.dimension
         strain, curvature = self.strains(space, poses)
         stress = self._stress(space)(*rate_of(space, self, lambda part, x: part._stored(space, x), poses, velocities))

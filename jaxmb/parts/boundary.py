@@ -128,8 +128,8 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
     if isinstance(part, AbstractForce):
-        measures = lambda part, *arguments: part.measures(space, *arguments)
-        yield "measures", (measures, [*_arguments(space, bodies)])
+        observables = lambda part, *arguments: part.observables(space, *arguments)
+        yield "observables", (observables, [*_arguments(space, bodies)])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])

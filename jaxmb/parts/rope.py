@@ -602,7 +602,7 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
         # Not the other way round: a path without tangents is not slack.
         return jnp.where(stretch < 0, 0.0, pull)
 
-    def measures(self, space, poses, velocities, t):
+    def observables(self, space, poses, velocities, t):
         stretch = lambda part, x: part._stretch(space, x)
         tensions = self._tension(*rate_of(space, self, stretch, poses, velocities))
         return {"tension": tensions[0] if self.spans == 1 else tensions}

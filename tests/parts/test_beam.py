@@ -74,7 +74,7 @@ def test_stiffnesses_of_shapes():
 @functools.partial(jax.jit, static_argnums=0)
 def kernels(space, part, poses, velocities):
     """The quantities and the wrenches at several poses and velocities."""
-    of = lambda q, v: (part.measures(space, q, v, 0.0), part.wrenches(space, q, v, 0.0))
+    of = lambda q, v: (part.observables(space, q, v, 0.0), part.wrenches(space, q, v, 0.0))
     return jax.vmap(of)(poses, velocities)
 
 
