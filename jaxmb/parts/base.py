@@ -321,8 +321,8 @@ class AbstractLink(AbstractActor):
     quantities: ClassVar[Quantities] = {}
     # Whether bodies touch each other, the ground or a road in it, as in a contact and a tyre.
     touches: ClassVar[bool] = False
-    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or among the `observables` of
-    # a force.
+    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or among the `observables`
+    # of a force.
     has_tension: ClassVar[bool] = False
     # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
     slides: ClassVar[tuple[str, ...]] = ()

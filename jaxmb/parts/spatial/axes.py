@@ -177,7 +177,9 @@ def shortest_turn(start: Vector3, end: Vector3) -> Float[Array, "4"]:
     """
     size = rot.norm(end)
     turn: Any = np.append(size + start @ end, rot.cross(start, end))
-    return rot.normalize(turn if turn[0] > 1e-12 * size else np.append(0.0, perpendiculars(start)[0]))
+    if not turn[0] > 1e-12 * size:
+        turn = np.append(0.0, perpendiculars(start)[0])
+    return rot.normalize(turn)
 
 
 def parallel(part) -> tuple[Product, ...]:
