@@ -22,6 +22,7 @@ ALONG = sections.Section(bending_stiffness=EI, axial_stiffness=EA, shear_stiffne
 DEEP = sections.Section(
     bending_stiffness=(2.0, EI), torsional_stiffness=3.0, axial_stiffness=EA, shear_stiffness=(50.0, GA)
 )
+BENT = {"bending_stiffness": 1.0}
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -72,10 +73,9 @@ def test_stiffnesses_of_shapes():
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def kernels(space, part, poses, velocities):
-    """The quantities and the wrenches at several poses and velocities."""
-    of = lambda q, v: (part.observables(space, q, v, 0.0), part.wrenches(space, q, v, 0.0))
-    return jax.vmap(of)(poses, velocities)
+def observed(space, part, poses, velocities):
+    """The quantities at several poses and velocities."""
+    return jax.vmap(lambda q, v: part.observables(space, q, v, 0.0))(poses, velocities)
 
 
 def test_stiffness_at_rest_is_that_of_the_element_of_timoshenko():
@@ -119,7 +119,7 @@ def turned(given, *rows):
 def test_pure_bending():
     """Sections at the ends of circular arcs: the moment is the stiffness times the angle over the length."""
     part, given = resolved(PLANE, planar.Beam("F", "a", "b", section=ALONG))
-    seen, _ = kernels(PLANE, part, turned(given, L * COS, L * SIN, ANGLES), np.zeros((3, 2, 3)))
+    seen = observed(PLANE, part, turned(given, L * COS, L * SIN, ANGLES), np.zeros((3, 2, 3)))
     np.testing.assert_allclose(seen["strain"], [[1.0, 0.0]] * 3, rtol=0, atol=1e-14)
     np.testing.assert_allclose(seen["curvature"], ANGLES / L, rtol=1e-14)
     np.testing.assert_allclose(seen["section_moment"], EI * ANGLES / L, rtol=1e-14)
@@ -131,7 +131,7 @@ def test_pure_bending_and_torsion_in_space():
     bent = turned(given, L * COS, L * SIN, ZERO, COS, ZERO, ZERO, SIN)
     twisted = turned(given, ZERO + L, ZERO, ZERO, COS, SIN, ZERO, ZERO)
     for poses, stiffness in ((bent, [0.0, 0.0, EI]), (twisted, [3.0, 0.0, 0.0])):
-        seen, _ = kernels(SPACE, part, poses, np.zeros((3, 2, 6)))
+        seen = observed(SPACE, part, poses, np.zeros((3, 2, 6)))
         np.testing.assert_allclose(seen["strain"], [[1.0, 0.0, 0.0]] * 3, rtol=0, atol=1e-14)
         np.testing.assert_allclose(seen["section_moment"], np.outer(ANGLES / L, stiffness), rtol=1e-13, atol=1e-14)
 
@@ -140,13 +140,26 @@ def test_stretch_shear_and_damping():
     """Of a beam that is pulled, sheared and moves on; a tension is positive."""
     part, given = resolved(PLANE, planar.Beam("F", "a", "b", section=ALONG, damping_time=0.1))
     poses, velocities = given + np.array([[0.0] * 3, [0.02, 0.01, 0.0]]), np.array([[0.0] * 3, [0.3, -0.2, 0.0]])
-    seen, (wrenches,) = kernels(PLANE, part, poses[None], velocities[None])
+    seen = observed(PLANE, part, poses[None], velocities[None])
+    wrenches = np.asarray(jax.jit(lambda q, v: part.wrenches(PLANE, q, v, 0.0))(poses, velocities))
     force = np.array([EA * (0.02 + 0.1 * 0.3), GA * (0.01 - 0.1 * 0.2)]) / L
     np.testing.assert_allclose(seen["section_force"][0], force, rtol=1e-13)
     np.testing.assert_allclose(wrenches[1, :2], -force, rtol=1e-12)
     # Without bending the moments of both ends are equal, and balance the pair of forces.
     pair = poses[1, 0] * force[1] - poses[1, 1] * force[0]
     np.testing.assert_allclose(wrenches[:, 2], pair / 2, rtol=1e-12)
+
+
+def test_rows_of_an_inextensible_beam():
+    """A tension holds back a stretch, and a shear force a shear: the rows fall where these grow, but not by bending."""
+    part, given = resolved(PLANE, planar.InextensibleBeam("F", "a", "b", section=sections.Section(**BENT)))
+    assert part.rows == 2
+    stretched = given + np.array([[0.0] * 3, [0.02, 0.01, 0.0]])
+    np.testing.assert_allclose(part.residual(PLANE, stretched, 0.0), [-0.02, -0.01], rtol=1e-12)
+    bent = turned(given, L * COS, L * SIN, ANGLES)[2]
+    np.testing.assert_allclose(part.residual(PLANE, bent, 0.0), 0.0, atol=1e-15)
+    bending = part.components()[1].energy(PLANE, bent, 0.0)
+    np.testing.assert_allclose(bending, 0.5 * ANGLES[2] ** 2 / L, rtol=1e-13)
 
 
 def test_curved_at_rest():
@@ -159,11 +172,11 @@ def test_curved_at_rest():
     part = planar.Beam("F", "a", "b", section=ALONG, angle_a=0.0, angle_b=0.0, damping_time=0.5).resolve(PLANE, poses)
     np.testing.assert_allclose(part.free_curvature, angle / L, rtol=1e-15)
     straight = np.stack([np.zeros(3), [L, 0.0, 0.0]])
-    seen, wrenches = kernels(PLANE, part, np.stack([poses, straight]), still)
-    np.testing.assert_allclose(wrenches[0], 0.0, atol=1e-13)
-    np.testing.assert_allclose(seen["section_moment"][1], -EI * angle / L, rtol=1e-13)
+    seen = observed(PLANE, part, np.stack([poses, straight]), still)
+    np.testing.assert_allclose(seen["section_force"][0], 0.0, atol=1e-13)
+    np.testing.assert_allclose(seen["section_moment"], [0.0, -EI * angle / L], rtol=1e-13, atol=1e-14)
     drift = jax.tree.map(lambda _: None, part).with_fields(free_curvature=np.array(2.0))
-    seen, _ = kernels(PLANE, part.with_fields(drift=drift), poses[None], still[:1])
+    seen = observed(PLANE, part.with_fields(drift=drift), poses[None], still[:1])
     np.testing.assert_allclose(seen["section_moment"], -EI * 0.5 * 2.0, rtol=1e-13)
     poses = np.stack([SPACE.ground, [*end[:2], 0.0, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]])
     deep = spatial.Beam("F", "a", "b", section=DEEP, orientation_a=IDENTITY, orientation_b=IDENTITY)
@@ -190,7 +203,6 @@ def test_sections_in_turned_bodies():
     np.testing.assert_allclose(mb.rotations.rotate(part.orientation_a, np.eye(3)[0]), [-1, 0, 0], rtol=0, atol=1e-15)
 
 
-BENT = {"bending_stiffness": 1.0}
 REFUSED = [
     (PLANE, sections.Section(**BENT), {}, "lacks axial_stiffness or shear_stiffness"),
     (PLANE, DEEP, {}, "section.bending_stiffness must be one number, got"),
