@@ -101,7 +101,7 @@ from .studies.sweep import sweep as sweep, load_sweep as load_sweep
 
 ## Modules
 from . import planar as planar, spatial as spatial
-from .parts import contact as contact, terrain as terrain, shapes as shapes
+from .parts import contact as contact, terrain as terrain, shapes as shapes, sections as sections
 from .linalg import rotations as rotations
 from .studies.sweep import cases as cases
 from . import mechanisms as mechanisms, importers as importers, viz as viz, report as report

@@ -683,9 +683,9 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
-    def tension(self, now: Kinematics) -> Float[Array, "parts spans"]:
-        """Tensions of the spans of ropes."""
-        return self._of_motion("tension", now)
+    def observables(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
+        """Further quantities of a motion, by name within the part."""
+        return self._of_motion("observables", now)
 
     def energy(self, t: Scalar, poses: BodyPoses) -> Float[Array, ""]:
         if not self.group.part.conservative:

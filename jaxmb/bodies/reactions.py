@@ -55,7 +55,7 @@ def joint_places(constraints: ConstraintSet, name: str) -> tuple[tuple[Place, ..
 
 
 def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
-    """The forces and moments of joints, and the tensions of ropes."""
+    """The forces and moments of joints, the tensions of ropes, and the quantities of force elements."""
     d = system.layout.space.dimension
     fields = {"force": (d,), "moment": () if d == 2 else (3,)}
     joints = {name: joint_places(system.constraints, name) for name in names}
@@ -64,20 +64,38 @@ def reaction_measures(system: Any, names: Sequence[str]) -> dict[str, Measure]:
         for name, joint in joints.items()
         for field, shape in fields.items()
     }
-    return of_joints | _tension_measures(system)
+    return of_joints | _tension_measures(system) | _force_measures(system)
 
 
 def _tension_measures(system) -> dict[str, Measure]:
     out = {}
-    for of_forces, groups in ((True, system.constraints.groups), (False, system.forces.groups)):
-        for g, group in enumerate(groups):
-            if group.group.part.has_tension:
-                # Of a rope with friction, whose constraint comes first, each side of a pulley.
-                spans = group.group.part.sides
-                shape = () if spans == 1 else (spans,)
-                for k, name in enumerate(group.group.names):
-                    out[f"{name}.tension"] = Measure(shape, _tension, (g, of_forces, shape, np.array(k)), of_forces)
+    for g, group in enumerate(system.constraints.groups):
+        if group.group.part.has_tension:
+            # Of a rope with friction, whose constraint comes first, each side of a pulley.
+            spans = group.group.part.sides
+            shape = () if spans == 1 else (spans,)
+            for k, name in enumerate(group.group.names):
+                out[f"{name}.tension"] = Measure(shape, _tension, (g, shape, np.array(k)), of_forces=True)
     return out
+
+
+def _force_measures(system) -> dict[str, Measure]:
+    """The quantities that force elements have, `"blade.section_force"`."""
+    guess, out = system.guess, {}
+    for g, group in enumerate(system.forces.groups):
+        at_guess = lambda group, q, u: group.observables(system.kinematics(jnp.zeros((), q.dtype), q, u))
+        for field, values in jax.eval_shape(at_guess, group, guess.q, guess.u).items():
+            for k, name in enumerate(group.group.names):
+                out[f"{name}.{field}"] = Measure(values.shape[1:], _of_force, (g, field, np.array(k)))
+    return out
+
+
+@view_of_motion
+def _of_force(system, place, ts, ys, solved):
+    del solved
+    number, field, member = place
+    alone = system.forces.groups[number].only(member)
+    return jax.vmap(lambda t, y: alone.observables(system.kinematics(t, y.q, y.u))[field][0])(ts, ys)
 
 
 def lifted_ropes(system: Any, motion: Any) -> list[str]:
@@ -104,8 +122,8 @@ def lifted_ropes(system: Any, motion: Any) -> list[str]:
 
 @view_of_motion
 def _tension(system, place, ts, ys, solved):
-    group, of_rows, shape, member = place
-    if of_rows and not (friction := system.constraints.groups[group]).of_poses:
+    group, shape, member = place
+    if not (friction := system.constraints.groups[group]).of_poses:
 
         def with_friction(t, y, multipliers):
             now = system.kinematics(t, y.q, y.u)
@@ -113,12 +131,8 @@ def _tension(system, place, ts, ys, solved):
             return friction.law.tensions(now, reactions)[member]
 
         return jax.vmap(with_friction)(ts, ys, solved.multipliers)
-    if of_rows:
-        pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
-        return pulls(solved.multipliers).reshape(-1, *shape)
-    alone = system.forces.groups[group].only(member)
-    pull = lambda t, y: alone.tension(system.kinematics(t, y.q, y.u))[0].reshape(shape)
-    return jax.vmap(pull)(ts, ys)
+    pulls = jax.vmap(lambda multipliers: system.constraints.of_groups(multipliers)[group][1][member])
+    return pulls(solved.multipliers).reshape(-1, *shape)
 
 
 @view_of_motion

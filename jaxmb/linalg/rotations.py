@@ -11,6 +11,7 @@ rotations.from_matrix(R), rotations.from_xyzw(rotations.to_xyzw(p))  # Both p.
 omega = jnp.array([0.0, 0.0, 2.0])
 rotations.angular_velocity(p, rotations.rates(p, omega))  # omega.
 rotations.norm(rotations.cross(x, omega))  # 2.
+rotations.rotation_vector(p)  # (0, 0, π/2).
 ```
 
 Euler parameters are `p = (e0, e1, e2, e3)`, `e0 = cos(angle/2)`. `rotation_matrix(p)` maps body components to world
@@ -21,6 +22,7 @@ Source: P. E. Nikravesh and I. S. Chung, "Application of Euler Parameters to the
 Constrained Mechanical Systems", J. Mech. Design 104(4), 1982.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -45,9 +47,15 @@ __all__ = [
     "rates",
     "rotate",
     "rotation_matrix",
+    "rotation_vector",
     "to_xyzw",
     "unrotate",
 ]
+
+
+# Of the arc tangent below this square: its series has converged, and its formula has not lost digits.
+_SMALL = 0.05
+_SERIES = [(-1) ** k / (2 * k + 1) for k in range(13)]
 
 
 def _tables():
@@ -210,6 +218,32 @@ def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
     columns = xp.concatenate([antisymmetric[:, None], symmetric], axis=1)
     columns = xp.concatenate([xp.concatenate([squares[:1], antisymmetric])[None], columns])
     return jax.device_put(normalize(columns[xp.argmax(squares)]))
+
+
+def half_turn(p: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Unit Euler parameters of half the shortest turn, smooth below half a turn."""
+    xp = namespace(p)
+    near = xp.where(p[0] < 0, -p, p)
+    return normalize(near + norm(p) * np.eye(4, dtype=p.dtype)[0])
+
+
+def rotation_vector(p: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The rotation vector [rad] of the shortest turn, the inverse of `from_axis_angle`.
+
+    It is smooth below half a turn, where it changes its sign. Derivatives of any order are also correct at zero.
+    """
+    half = half_turn(p)
+    tangent = half[1:] / half[0]
+    return 4.0 * _arc_tangent_ratio(dot(tangent, tangent)) * tangent
+
+
+def _arc_tangent_ratio(square):
+    """`arctan(x) / x`, a smooth function of `x²` in [0, 1]."""
+    xp = namespace(square)
+    small = square < _SMALL
+    root, near = xp.sqrt(xp.where(small, 1.0, square)), xp.where(small, square, 0.0)
+    series = functools.reduce(lambda total, term: total * near + term, reversed(_SERIES), 0.0)
+    return xp.where(small, series, xp.arctan(root) / root)
 
 
 def to_xyzw(p: Float[ArrayLike, "... 4"]) -> Float[Array, "... 4"]:

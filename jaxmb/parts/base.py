@@ -446,8 +446,8 @@ class AbstractLink(AbstractActor):
     quantities: ClassVar[Quantities] = {}
     # Whether bodies touch each other, the ground or a road in it, as in a contact and a tyre.
     touches: ClassVar[bool] = False
-    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or the value of the kernel
-    # `tension` of a force.
+    # Whether it pulls with a tension [N] in each of its `spans`: the multiplier of each row, or among the `observables`
+    # of a force.
     has_tension: ClassVar[bool] = False
     # Names of the coordinates whose rates are the slip, if the bodies slide over each other in two directions.
     slides: ClassVar[tuple[str, ...]] = ()
@@ -760,6 +760,13 @@ class AbstractForce(AbstractLink):
     @abc.abstractmethod
     def wrenches(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> Wrenches:
         """The wrench on each of its bodies."""
+
+    def observables(
+        self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar
+    ) -> dict[str, Float[Array, "..."]]:
+        """Hook: quantities of a motion by their names within the part, such as section forces of a beam."""
+        del space, poses, velocities, t
+        return {}
 
     def gaps(self, space: AbstractSpace, poses: Poses, t: Scalar) -> Float[Array, "gaps"]:
         """Hook: the gaps [m, rad] of a part that `has_gaps`, negative where the force acts. Each is a distance from a

@@ -132,6 +132,9 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         yield "elements", (lambda part: part.elements, [])
+    if isinstance(part, AbstractForce):
+        observables = lambda part, *arguments: part.observables(space, *arguments)
+        yield "observables", (observables, [*_arguments(space, bodies)])
     if isinstance(part, AbstractLink):
         poses, velocities, t = _arguments(space, bodies)
         yield "coordinates", (lambda part, poses: part.coordinates(space, poses), [poses])

@@ -602,10 +602,10 @@ class ElasticRope(AbstractRope, AbstractPotentialForce):
         # Not the other way round: a path without tangents is not slack.
         return jnp.where(stretch < 0, 0.0, pull)
 
-    def tension(self, space, poses, velocities, t):
-        """The tension of each span [N]."""
+    def observables(self, space, poses, velocities, t):
         stretch = lambda part, x: part._stretch(space, x)
-        return self._tension(*rate_of(space, self, stretch, poses, velocities))
+        tensions = self._tension(*rate_of(space, self, stretch, poses, velocities))
+        return {"tension": tensions[0] if self.spans == 1 else tensions}
 
     def wrenches(self, space, poses, velocities, t):
         stretch = lambda part, x: part._stretch(space, x)

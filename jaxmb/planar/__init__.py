@@ -27,6 +27,7 @@ from ..parts.planar.joints import (
     RackAndPinion as RackAndPinion,
 )
 from ..parts.distance import Distance as Distance
+from ..parts.beam import InextensibleBeam as InextensibleBeam
 from ..parts.knife_edge import KnifeEdge as KnifeEdge
 from ..parts.drivers import Driver as Driver
 
@@ -35,6 +36,8 @@ from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, Point
 from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
 from ..parts.planar.torsion import TorsionalSpringDamper as TorsionalSpringDamper
 from ..parts.bushing import Bushing as Bushing
+from ..parts.beam import Beam as Beam
+from ..parts.beam_chain import beam_chain as beam_chain, BeamChain as BeamChain
 from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.planar.draft_gear import DraftGear as DraftGear
 from ..parts.friction import Friction as Friction

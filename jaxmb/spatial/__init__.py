@@ -37,6 +37,7 @@ from ..parts.spatial.joints import (
     Fixed as Fixed,
 )
 from ..parts.distance import Distance as Distance
+from ..parts.beam import InextensibleBeam as InextensibleBeam
 from ..parts.spatial.point_joints import PointOnLine as PointOnLine, PointOnPlane as PointOnPlane
 from ..parts.spatial.composite import Composite as Composite
 from ..parts.knife_edge import KnifeEdge as KnifeEdge
@@ -47,6 +48,8 @@ from ..parts.drivers import Driver as Driver
 from ..parts.forces import SpringDamper as SpringDamper, Damper as Damper, PointForce as PointForce
 from ..parts.forces import RotationalDamper as RotationalDamper, Torque as Torque
 from ..parts.bushing import Bushing as Bushing
+from ..parts.beam import Beam as Beam
+from ..parts.beam_chain import beam_chain as beam_chain, BeamChain as BeamChain
 from ..parts.cylinder import Cylinder as Cylinder
 from ..parts.friction import Friction as Friction
 

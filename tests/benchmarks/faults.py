@@ -25,6 +25,17 @@ FAULTS = [
         "(self._clipped_control() - self.activation) / self.lag",
         "(self._clipped_control() - self.activation) * self.lag",
     ),
+    Fault("parts/beam.py", "rot.rotate_2d(-start - turn / 2,", "rot.rotate_2d(-start - turn,"),
+    Fault("parts/beam.py", "rot.unrotate(rot.half_turn(turn), in_a)", "rot.unrotate(turn, in_a)"),
+    Fault("parts/beam.py", "(strain + self.damping_time * rate)", "(strain - self.damping_time * rate)"),
+    Fault("parts/beam.py", "-self.length * law(x, v)", "-law(x, v)"),
+    Fault("parts/beam.py", "return -self.length * self.deformations", "return self.length * self.deformations"),
+    Fault("parts/beam.py", '"section_moment": moment.reshape', '"section_moment": -moment.reshape'),
+    Fault("parts/beam_chain.py", "halves(masses * squares / 12)", "halves(masses * squares / 3)"),
+    Fault("parts/beam_chain.py", "np.convolve(values, (0.5, 0.5))", "np.convolve(values, (1.0, 0.0))"),
+    Fault("parts/sections.py", "10 * (1 + self.poisson_ratio)", "12 * (1 + self.poisson_ratio)"),
+    Fault("parts/sections.py", "[torsion, y * z**3 / 12, z * y**3 / 12]", "[torsion, z * y**3 / 12, y * z**3 / 12]"),
+    Fault("parts/sections.py", "sums = _ODD_SUM - xp.sum", "sums = _ODD_SUM + xp.sum"),
     Fault(
         "parts/bushing.py",
         "law = lambda x, v: -self.stiffness * x - self.damping * v",
@@ -415,9 +426,6 @@ FAULTS = [
         "return rot.multiply(rot.conjugate(part.orientation), relative_orientation(poses))[1:]",
     ),
     Fault(
-        "parts/spatial/axes.py", "2 * jax.numpy.arctan2(sine, cosine) / sine", "jax.numpy.arctan2(sine, cosine) / sine"
-    ),
-    Fault(
         "parts/spatial/axes.py",
         "turning = direction_in_a(space, poses, velocities[1, 3:]) - velocities[0, 3:]",
         "turning = direction_in_a(space, poses, velocities[1, 3:]) + velocities[0, 3:]",
@@ -427,7 +435,7 @@ FAULTS = [
         "held = space.body_point(poses[0], space.point(poses[1], part.point_b))",
         "held = part.point_a",
     ),
-    Fault("parts/spatial/axes.py", "x - (end @ x) / half * (start + end)", "x - (end @ x) / half * end"),
+    Fault("parts/spatial/axes.py", "np.append(size + start @ end, rot", "np.append(start @ end, rot"),
     Fault("parts/spatial/bodies.py", "(3 * radius**2 + length**2) / 12", "(radius**2 + length**2) / 12"),
     Fault("parts/spatial/bodies.py", "stack([y2 + z2, z2 + x2, x2 + y2])", "stack([y2 + z2, x2 + y2, z2 + x2])"),
     Fault("parts/spatial/bodies.py", "moment = 2 * as_parameter(mass)", "moment = as_parameter(mass)"),
@@ -809,6 +817,8 @@ FAULTS = [
         "antisymmetric = xp.stack([difference[1, 2], difference[2, 0], difference[0, 1]])",
     ),
     Fault("linalg/rotations.py", "return 4.0 * pull_back(p, pdot)", "return 2.0 * pull_back(p, pdot)"),
+    Fault("linalg/rotations.py", "total * near + term", "total * near"),
+    Fault("linalg/rotations.py", "near = xp.where(p[0] < 0, -p, p)", "near = p"),
     # Batches in lanes
     Fault(
         "lanes/control.py",

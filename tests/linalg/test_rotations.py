@@ -121,3 +121,35 @@ def test_single_precision_stays():
     """Of arrays of NumPy as of those of JAX: scenes are checked with the former."""
     p = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
     assert rot.rotation_matrix(p).dtype == jax.eval_shape(rot.rotation_matrix, p).dtype == np.float32
+
+
+def test_rotation_vectors():
+    """Those of SciPy, of Euler parameters of both signs and any length."""
+    others = Rotation.from_quat(np.roll(UNIT, -1, axis=1)).as_rotvec()
+    for p, expected in zip(UNIT, others, strict=True):
+        for own in (p, -p, 2.0 * p):
+            np.testing.assert_allclose(rot.rotation_vector(own), expected, rtol=0, atol=1e-14)
+        half = Rotation.from_rotvec(expected / 2).as_quat(scalar_first=True)
+        np.testing.assert_allclose(rot.half_turn(p), half * np.sign(half[0]), rtol=0, atol=1e-14)
+    # After a small turn about another axis.
+    p, w = UNIT[0] * np.sign(UNIT[0, 0]), np.array([0.3, -0.2, 0.5])
+    turned = lambda e: Rotation.from_quat(p, scalar_first=True) * Rotation.from_rotvec(e * w)
+    difference = (turned(1e-5).as_rotvec() - turned(-1e-5).as_rotvec()) / 2e-5
+    found = jax.jit(lambda p, w: jax.jvp(rot.rotation_vector, (p,), (rot.rates(p, w),))[1])(p, w)
+    np.testing.assert_allclose(found, difference, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_rotation_vectors():
+    """Of turns about one axis, of all orders: also at zero, and where the series ends."""
+    axis = np.array([0.6, 0.0, -0.8])
+
+    def along(angle):
+        turn = jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])
+        return rot.dot(rot.rotation_vector(turn), axis)
+
+    angles = np.array([0.0, 1e-9, 1e-4, 0.8, 0.88, 0.89, 2.0, 3.1])
+    first, second, third = jax.grad(along), jax.grad(jax.grad(along)), jax.jacfwd(jax.grad(jax.grad(along)))
+    every = lambda x: (along(x), first(x), jax.jacfwd(along)(x), second(x), third(x))
+    for found, expected in zip(jax.jit(jax.vmap(every))(angles), (angles, 1.0, 1.0, 0.0, 0.0), strict=True):
+        np.testing.assert_allclose(found, np.broadcast_to(expected, 8), rtol=1e-14, atol=1e-12)

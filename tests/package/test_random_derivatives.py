@@ -150,12 +150,15 @@ def on_the_ground():
 
 
 OF_BOTH = (
-    "Body, PointMass, SpringDamper, Damper, PointForce, Torque, RotationalDamper, Bushing, Cylinder, Contact, Tyre"
+    "Body, PointMass, SpringDamper, Damper, PointForce, Torque, RotationalDamper, Bushing, Beam, Cylinder, Contact, "
+    "Tyre"
 )
 PLANAR_FORCES = named("planar", f"{OF_BOTH}, TorsionalSpringDamper, DraftGear, Track, PlateContact, DiscContact")
 SPATIAL_FORCES = named("spatial", f"{OF_BOTH}, MagicFormulaTyre")
 # Examples, and how they are integrated.
-GROUPS = {"planar joints": (named("planar", "Revolute, Fixed, PointOnLine, Prismatic, Distance"), FIXED)}
+GROUPS = {
+    "planar joints": (named("planar", "Revolute, Fixed, PointOnLine, Prismatic, Distance, InextensibleBeam"), FIXED)
+}
 # Examples that are not moved, which takes a third of the time, and how their accelerations are solved for.
 INSTANTS = {
     "planar gears and drivers": (
@@ -172,7 +175,7 @@ INSTANTS = {
         named("spatial", "Screw, Prismatic, Planar, Fixed, Composite"),
         UdwadiaKalaba("inverses"),
     ),
-    "spatial points": (named("spatial", "Distance, PointOnPlane, PointOnLine, Driver"), NullSpace()),
+    "spatial points": (named("spatial", "Distance, InextensibleBeam, PointOnPlane, PointOnLine, Driver"), NullSpace()),
     "spatial rolling": (named("spatial", "KnifeEdge, RollingDisc, RollingSphere"), UdwadiaKalaba("singular_mass")),
     "spatial friction": ([rubbing_3d()], Partitioned()),
     "spatial forces": (SPATIAL_FORCES, Multipliers()),

@@ -115,7 +115,7 @@ def test_joint_resolves_to_body_fixed_form(space, key):
     again = type(part)(**given).resolve(own.space, own.elsewhere)
     moved = own.residual(again, own.moved), own.residual(part, own.moved)
     np.testing.assert_allclose(*moved, rtol=0, atol=1e-13)
-    if space == "spatial" and key != "Distance":
+    if space == "spatial" and key not in ("Distance", "InextensibleBeam"):
         ends = [
             own.space.point(q, np.asarray(point)) for q, point in zip(poses, (part.point_a, part.point_b), strict=True)
         ]

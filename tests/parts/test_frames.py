@@ -7,7 +7,7 @@ import pytest
 from part_cases import random_poses, rotated
 
 import jaxmb as mb
-from jaxmb import planar, rotations, spatial
+from jaxmb import planar, rotations, sections, spatial
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
 from jaxmb.system.quantities import Solved
@@ -80,6 +80,7 @@ def test_a_frame_that_moves_takes_its_joint_along():
     [
         spatial.SpringDamper("force", "on a", "on b", stiffness=7.0, point_a=(0.1, 0.0, 0.0)),
         spatial.Bushing("force", "on a", "on b", stiffness=np.arange(1.0, 7.0), point=(0.2, 0.0, 0.1)),
+        spatial.Beam("force", "on a", "on b", section=sections.Circle(radius=0.3, modulus=50.0, poisson_ratio=0.3)),
     ],
 )
 def test_forces_on_frames_do_the_work_of_their_energy(force):

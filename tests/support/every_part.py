@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmb as mb
-from jaxmb import planar, spatial
+from jaxmb import planar, sections, spatial
 from jaxmb.manifold.default import Unconstrained
 from jaxmb.parts import AbstractForce, AbstractNonIdeal, contact, terrain, tir
 
@@ -140,6 +140,7 @@ TYRE_3D = tir.read("", TYRE_FILE).coefficients | {
     "FZMIN": 0.1,
     "FZMAX": 1e3,
 }
+SECTION = sections.Section(bending_stiffness=4.0, torsional_stiffness=3.0, axial_stiffness=90.0, shear_stiffness=60.0)
 CYLINDER_2D = {"bore_area": 2e-3, "pressure": 8e3, "rod_area": 1.5e-3, "rod_pressure": 2e3}
 DRAFT_GEAR = {"stiffness": 300.0, "preload": 5.0, "travel": 0.2, "stop_stiffness": 500.0, "transition_speed": 0.5}
 DRAFT_GEAR |= {"smoothing": 0.05}
@@ -167,6 +168,8 @@ PLANAR = [
     of_ground_2d(planar.TorsionalSpringDamper, "stiffness", stiffness=5.0, damping=0.2, free_angle=0.8),
     of_ground_2d(planar.RotationalDamper, "damping", damping=0.3),
     of_ground_2d(planar.Bushing, "stiffness", stiffness=(30.0, 20.0, 3.0), damping=(1.0, 1.0, 0.1), point=(0.0, 0.0)),
+    of_ground_2d(planar.Beam, "section.bending_stiffness", section=SECTION, damping_time=0.02, point_b=(0.1, 0.2)),
+    of_ground_2d(planar.InextensibleBeam, "length", section=SECTION, damping_time=0.02, point_b=(0.1, 0.2)),
     of_ground_2d(planar.Cylinder, "bore_area", point_a=(0.1, -0.6), point_b=(0.1, 0.2), **CYLINDER_2D),
     of_ground_2d(planar.DraftGear, "preload", free_length=0.3, **DRAFT_GEAR),
     track(),
@@ -448,6 +451,10 @@ SPATIAL = [
     of_ground_3d(
         spatial.Bushing, "stiffness", stiffness=(30.0, 20.0, 25.0, 3.0, 4.0, 5.0), damping=np.full(6, 0.3), point=O
     ),
+    of_ground_3d(
+        spatial.Beam, "section.bending_stiffness", section=SECTION, damping_time=0.02, point_b=(0.1, 0.2, 0.0)
+    ),
+    of_ground_3d(spatial.InextensibleBeam, "length", section=SECTION, damping_time=0.02, point_b=(0.1, 0.2, 0.0)),
     of_ground_3d(spatial.Cylinder, "pressure", bore_area=2e-3, pressure=8e3, point_a=(0.1, 0.0, -0.6)),
     on_body_3d(spatial.Contact, "normal.stiffness", **GROUND_2D),
     on_body_3d(spatial.Tyre, "slip_stiffness", **TYRE_2D),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from jaxmb import planar, spatial
+from jaxmb import planar, sections, spatial
 from jaxmb.parts import AbstractCompound, AbstractVelocityConstraint, contact, terrain
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
@@ -22,6 +22,11 @@ SPACES = {"planar": PLANE, "spatial": SPACE}
 # Points of A and of B; in the plane their first two numbers.
 POINTS = {2: ((0.1, -0.2), (0.4, 0.3)), 3: ((0.1, -0.2, 0.3), (0.4, 0.1, -0.2))}
 RATIO, RADIUS, PITCH = -0.4, 0.3, -0.3
+# Of beams.
+SECTIONS = {
+    "planar": sections.Section(bending_stiffness=4.0, axial_stiffness=30.0, shear_stiffness=20.0),
+    "spatial": sections.Rectangle(thickness=0.5, width=0.8, modulus=90.0, poisson_ratio=0.3),
+}
 # A joint is given in one of these ways in the world, which `resolve` turns into numbers fixed in its bodies.
 IN_THE_WORLD = ("point", "axes_W", "points_W", "axis", "axis_a_W", "axis_b_W", "axis_1_W", "axis_2_W", "axis_3_W")
 
@@ -147,6 +152,15 @@ def on_link(q, point, axis, second, x):
     return with_b(q, move(move(q[1], turn_3(x[2:]), B), product(turn(u, x[0]), turn(v, x[1])), A))
 
 
+def bent(q, point, axis, second, x):
+    """B turned about A by half of a turn, and then about its own end by the other half."""
+    space = PLANE if q.shape[1] == 3 else SPACE
+    s, t = POINTS[space.dimension]
+    half = x[0] / 2 if space is PLANE else turn_3(x / 2)
+    moved = move(q[1], half, space.point(q[0], np.array(s)))
+    return with_b(q, move(moved, half, space.point(moved, np.array(t))))
+
+
 def on_circle(q, point, axis, second, x):
     B = PLANE.point(q[1], np.array(POINTS[2][1]))
     return with_b(q, move(move(q[1], x[0], B), x[1], q[0, :2]))
@@ -232,6 +246,7 @@ JOINTS = {
         "PointOnLine": Case(1, world(planar.PointOnLine), of_b(lambda b, p, a, s, x: move(b, x[0], p, x[1] * a))),
         "Prismatic": Case(2, world(planar.Prismatic), of_b(lambda b, p, a, s, x: move(b, 0.0, p, x[0] * a))),
         "Distance": Case(1, between_points(planar.Distance), on_link),
+        "InextensibleBeam": Case(2, between_points(planar.InextensibleBeam, section=SECTIONS["planar"]), bent),
         "PointOnCurve": Case(1, ring, on_circle),
         "Gear": Case(1, gears, meshed, bodies=3, freedoms=8, numbers=10),
         "RackAndPinion": Case(1, rack, on_rack, freedoms=5),
@@ -251,6 +266,7 @@ JOINTS = {
         "Composite": composite("hinge", "hinge"),
         "Composite of all kinds": composite("hinge", "slide", "hinge", "slide", "hinge"),
         "Distance": Case(1, between_points(spatial.Distance), on_link),
+        "InextensibleBeam": Case(3, between_points(spatial.InextensibleBeam, section=SECTIONS["spatial"]), bent),
         "PointOnPlane": Case(
             1, world(spatial.PointOnPlane), of_b(lambda b, p, a, s, x: move(b, turn_3(x[2:]), p, along(a, x)))
         ),
@@ -291,6 +307,7 @@ def springs(name, damping):
             "F", "a", "b", stiffness=30.0, damping=2.0 * damping, free_length=0.4, **points
         ),
         "Bushing": module.Bushing("F", "a", "b", stiffness=numbers, damping=loses, **points),
+        "Beam": module.Beam("F", "a", "b", section=SECTIONS[name], damping_time=0.1 * damping, **points),
     }
     if space is SPACE:
         return out

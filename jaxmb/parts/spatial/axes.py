@@ -147,13 +147,7 @@ def turn_about(axis: Vector3, start: Vector3, end: Vector3) -> Float[Array, ""]:
 def rotation_vector(part, poses: Float[Array, "k p"]) -> Vector3:
     """The rotation vector [rad], in A, of the shortest turn from `part.orientation` to the relative attitude."""
     turned = rot.multiply(relative_orientation(poses), rot.conjugate(part.orientation))
-    turned = jax.numpy.where(turned[0] < 0, -turned, turned)
-    cosine, vector = turned[0], turned[1:]
-    square = vector @ vector
-    small = square < 1e-16
-    sine = jax.numpy.sqrt(jax.numpy.where(small, 1.0, square))
-    # Near zero twice the vector part, whose derivatives are also correct there.
-    return jax.numpy.where(small, 2.0, 2 * jax.numpy.arctan2(sine, cosine) / sine) * vector
+    return rot.rotation_vector(turned)
 
 
 def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
@@ -168,7 +162,8 @@ def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
         )
     if part.x_a is None:
         x_a, _ = perpendiculars(part.axis_a)
-        turned = x_a if axis_b is None else _carried(x_a, part.axis_a, direction_in_a(space, poses, axis_b))
+        turn = None if axis_b is None else shortest_turn(part.axis_a, direction_in_a(space, poses, axis_b))
+        turned = x_a if turn is None else rot.rotate(turn, x_a)
         return part.filled(x_a=x_a, x_b=space.body_direction(poses[1], space.direction(poses[0], turned)))
     for x, axis, names in ((part.x_a, part.axis_a, ("x_a", "axis_a")), (part.x_b, axis_b, ("x_b", "axis_b"))):
         if axis is not None and abs(float(x @ axis)) > 1e-6:
@@ -176,12 +171,15 @@ def measured_from_given_poses(part, space, poses: Float[Array, "k p"]):
     return part
 
 
-def _carried(x: Vector3, start: Vector3, end: Vector3) -> Vector3:
-    """A vector perpendicular to the direction `start`, after the shortest turn from `start` to `end`."""
-    half = 1.0 + start @ end
-    # Between opposite directions any half turn is shortest.
-    turned = x if half < 1e-12 else x - (end @ x) / half * (start + end)
-    return turned / np.sqrt(turned @ turned)
+def shortest_turn(start: Vector3, end: Vector3) -> Float[Array, "4"]:
+    """Euler parameters of the shortest turn from a unit vector to the direction of another vector, both concrete;
+    between opposite ones a half turn about the first of the `perpendiculars`.
+    """
+    size = rot.norm(end)
+    turn: Any = np.append(size + start @ end, rot.cross(start, end))
+    if not turn[0] > 1e-12 * size:
+        turn = np.append(0.0, perpendiculars(start)[0])
+    return rot.normalize(turn)
 
 
 def parallel(part) -> tuple[Product, ...]:
