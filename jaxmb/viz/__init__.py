@@ -17,3 +17,4 @@ from .motion import plot_motion as plot_motion
 from .movie import save_movie as save_movie
 from .root_locus import plot_root_locus as plot_root_locus
 from .scene import plot_scene as plot_scene
+from .sweep import plot_sweep as plot_sweep

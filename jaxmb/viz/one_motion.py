@@ -3,11 +3,14 @@
 import jax
 import numpy as np
 
+from .._arguments import check_kind
 from .._results import RESULTS
 from .._types import State
 from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
 from ..trajectory import Trajectory, states_of, still
+
+_OF_A_FILE = "what load reads from a file has arrays by name, without a system"
 
 
 def as_motion(shown: Trajectory | State, system: AbstractSystem | None) -> Trajectory:
@@ -33,6 +36,7 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
     """
     if isinstance(trajectory, State):
         raise ValueError(f"{name} shows a motion, got a State, which plot_mechanism and show take.")
+    check_kind(f"{name}: trajectory", trajectory, Trajectory, "a motion from simulate", _OF_A_FILE)
     states_of(trajectory)
     if trajectory.ts.ndim != 1:
         shape = trajectory.ts.shape[:-1]

@@ -3,14 +3,15 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import ArrayLike
 
-from ..._arguments import whole_number
+from ..._arguments import package_for_tables, whole_number
+from ..._pictured import picture
 from ..._printed import Printed
 from ..._types import VectorLike
 from ...parts.names import names_arguments
@@ -24,6 +25,9 @@ from .starts import starting_points
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate
 from .unconstrained import first_order
 from .verdict import objection
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Gradients below this, relative to the start's, belong to an optimum.
 _BALANCED = 1e-3
@@ -76,6 +80,7 @@ class Optimum(Printed):
     ```python
     print(best)  # Tables of parameters, outputs and constraints, for `best` from `optimise`.
     best.parameters["bar.inertia"], best.outputs["angle"], best.success
+    best.plot().savefig("optimum.png")
     ```
 
     **Fields:**
@@ -108,6 +113,31 @@ class Optimum(Printed):
     success: bool
     message: str
     derivatives: str
+
+    def plot(self, *outputs: str, along: Mapping[str, Any] | None = None) -> "Figure":
+        """Plot the objective along the iterations, and the parameters before and after; or outputs before and after.
+
+        **Arguments:** `outputs` by name, to show instead; `along`: the label and the values of their horizontal axis,
+        `{"t [s]": ts}`, default the numbers of the components. Bounds that hold for all components are dotted lines.
+
+        **Returns:** a matplotlib `Figure`. Parameters are drawn relative to the larger of start and optimum.
+
+        **Raises:** `ValueError` for an unknown output, and values of another number; `ImportError` without matplotlib.
+        """
+        return picture("optimum", self, outputs, along)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each component of the parameters: `start` and `optimum`.
+
+        **Raises:** `ImportError` without pandas.
+        """
+        rows = {
+            name: (float(a), float(b))
+            for key, value in self.parameters.items()
+            for name, a, b in zip(component_names(key, value.shape), self.start[key].flat, value.flat, strict=True)
+        }
+        frame = package_for_tables("pandas", "pandas").DataFrame
+        return frame(list(rows.values()), index=list(rows), columns=["start", "optimum"])
 
     def __repr__(self) -> str:
         return f"Optimum: objective {self.objective:.6g}, {self.message}"

@@ -1,0 +1,122 @@
+"""An optimisation: the objective along its iterations, parameters and outputs before and after."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..studies.optimise import Optimum
+from ..system.quantities import component_names
+from .figure import chosen, color, finish_panel, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# An objective that falls by more than this factor has a logarithmic axis; the largest number of parameters.
+_DECADES, _MOST = 30.0, 20
+# Trials that raise the objective by more than this part of its range are beyond the picture.
+_BEYOND = 1.5
+
+
+def plot(best: Optimum, names: Sequence[str] = (), along: Mapping[str, Any] | None = None) -> "Figure":
+    """As `Optimum.plot`."""
+    return _outputs(best, names, along) if names else _progress(best)
+
+
+def _progress(best) -> "Figure":
+    """The objective and the violation of constraints along the iterations, and the parameters."""
+    figure = new_figure(9.0, 4.2)
+    violated = any(i.violation > 0 for i in best.iterations)
+    sides: Any = figure.subfigures(1, 2, width_ratios=(1.1, 1))
+    left, right = sides
+    places: Any = left.subplots(1 + violated, 1, sharex=True, squeeze=False)[:, 0]
+    numbers = np.array([i.number for i in best.iterations])
+    objective = np.array([i.objective for i in best.iterations])
+    accepted = np.array([i.accepted for i in best.iterations], bool)
+    _draw_course(places[0], numbers, objective, accepted)
+    places[0].axhline(best.objective, color="0.4", linewidth=0.8, linestyle="--")
+    finish_panel(places[0], "objective")
+    if violated:
+        places[1].plot(numbers, [100 * i.violation for i in best.iterations], ".-", color=color(1))
+        finish_panel(places[1], "violation [%]")
+    places[-1].set_xlabel("iteration")
+    places[-1].xaxis.get_major_locator().set_params(integer=True)
+    _parameters(right.subplots(), best)
+    verdict = f"objective {best.objective:.5g}: {best.message}"
+    figure.suptitle(verdict if len(verdict) < 110 else verdict[:107] + "…", fontsize="medium")
+    return figure
+
+
+def _draw_course(axes, numbers, objective, accepted):
+    """Accepted iterations as a line with dots, others as rings, unless they leave the picture."""
+    axes.plot(numbers[accepted], objective[accepted], "o-", color=color(0), markersize=4, label="best so far")
+    if not accepted.all():
+        axes.plot(numbers[~accepted], objective[~accepted], "o", color="0.6", fillstyle="none", label="tried")
+    low, high = objective[accepted].min(initial=np.inf), objective[accepted].max(initial=-np.inf)
+    if low > 0 and high > _DECADES * low:
+        axes.set_yscale("log")
+    elif objective.size and objective.max() > high + _BEYOND * (high - low) > high:
+        axes.set_ylim(low - 0.1 * (high - low), high + _BEYOND * (high - low))
+
+
+def _parameters(axes, best):
+    """Parameters at start and optimum, relative to the larger of both, with their values in words."""
+    rows = [
+        (name, float(a), float(b))
+        for key, value in best.parameters.items()
+        for name, a, b in zip(component_names(key, value.shape), best.start[key].flat, value.flat, strict=True)
+    ]
+    change = lambda row: abs(row[2] - row[1]) / (max(abs(row[1]), abs(row[2])) or 1.0)
+    kept = sorted(rows, key=change)[-_MOST:]
+    shown = [row for row in rows if row in kept][::-1]
+    for k, (_, a, b) in enumerate(shown):
+        size = max(abs(a), abs(b)) or 1.0
+        axes.plot([a / size, b / size], [k, k], color="0.75", linewidth=2, zorder=1)
+        axes.plot(a / size, k, "o", color="0.55", zorder=2, label="start" if k == 0 else None)
+        axes.plot(b / size, k, "o", color=color(0), zorder=3, label="optimum" if k == 0 else None)
+    axes.set_yticks(range(len(shown)), [f"{name}\n{a:.4g} → {b:.4g}" for name, a, b in shown], fontsize="small")
+    axes.set_ylim(-0.6, len(shown) - 0.4)
+    axes.set_xlabel("value, relative to the larger of both")
+    axes.grid(alpha=0.3, axis="x")
+    note = f"{len(shown)} of {len(rows)}, those that change most: " if len(shown) < len(rows) else ""
+    axes.set_title(f"{note}○ start (grey), ● optimum", fontsize="small", loc="left")
+
+
+def _outputs(best, names, along) -> "Figure":
+    """Outputs before and after, one panel each, with bounds that are the same for all components."""
+    names = chosen("output", names, best.outputs)
+    ((xlabel, x),) = (along or {"component": None}).items()
+    figure = new_figure(9.0, 2.4 * len(names) + 0.6)
+    places: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, name in zip(places, names, strict=True):
+        for label, values, of_curve in (("before", best.before[name], "0.55"), ("after", best.outputs[name], color(0))):
+            table = np.atleast_1d(values).reshape(np.size(values) if np.ndim(values) < 1 else len(values), -1)
+            ticks = np.arange(len(table)) if x is None else np.asarray(x)
+            if ticks.shape != (len(table),):
+                raise ValueError(
+                    f"plot: along must have {len(table)} values, as {name!r} has; got shape {ticks.shape}."
+                )
+            for k, column in enumerate(table.T):
+                marker = "o" if len(table) == 1 else None
+                axes.plot(
+                    ticks,
+                    column,
+                    "-" if k == 0 else "--",
+                    color=of_curve,
+                    marker=marker,
+                    label=label if k == 0 else None,
+                )
+        limited = [c for c in best.constraints if c.name.split("[")[0] == name]
+        for bound in {c.low for c in limited} if len({c.low for c in limited}) == 1 else ():
+            _draw_bound(axes, bound)
+        for bound in {c.high for c in limited} if len({c.high for c in limited}) == 1 else ():
+            _draw_bound(axes, bound)
+        finish_panel(axes, name)
+    places[-1].set_xlabel(xlabel)
+    return figure
+
+
+def _draw_bound(axes, bound):
+    if np.isfinite(bound):
+        labels = axes.get_legend_handles_labels()[1]
+        axes.axhline(bound, color="black", linewidth=0.9, linestyle=":", label=None if "bound" in labels else "bound")
