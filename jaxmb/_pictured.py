@@ -4,6 +4,7 @@ import importlib
 from typing import Any
 
 
-def picture(module: str, shown: Any, *arguments: Any, **options: Any) -> Any:
-    """The figure of a result by the function `plot` of a module of `viz`, which stands above the result."""
-    return importlib.import_module(f"{__package__}.viz.{module}").plot(shown, *arguments, **options)
+def picture(function: str, shown: Any, *arguments: Any, **options: Any) -> Any:
+    """The figure of a result by a function of `viz`, `"loads.plot"`, which stands above the result."""
+    module, _, name = function.partition(".")
+    return getattr(importlib.import_module(f"{__package__}.viz.{module}"), name)(shown, *arguments, **options)

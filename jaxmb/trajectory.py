@@ -654,7 +654,7 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ValueError` for an unknown name, a batch or fewer than two times; `ImportError` without matplotlib.
         """
-        return picture("motion", self, names or None)
+        return picture("motion.plot_motion", self, names or None)
 
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`.

@@ -121,7 +121,7 @@ class Loads(Printed, eqx.Module):
         **Raises:** `ValueError` for an unknown name, a time outside of the motion and a batch; `ImportError` without
         matplotlib.
         """
-        return picture("loads", self, names, t)
+        return picture("loads.plot", self, names, t)
 
     def to_pandas(self) -> Any:
         """A `pandas.DataFrame` with a row for each time and load, and the columns of `to_csv`.

@@ -14,13 +14,15 @@ if TYPE_CHECKING:
 
 # The largest numbers of curves in a panel, and of panels in a column.
 MOST, _STACKED = 8, 4
+# The largest numbers of names, and of their letters, in a row above a panel.
+_IN_ROW, _LETTERS = 4, 90
 # Of the components of a vector.
 STYLES = ("-", "--", ":", "-.")
 # Units that are shown with prefixes, each from its size on.
 _PREFIXED = {"N": "kM", "N m": "kM", "N s": "kM", "Pa": "kMG", "W": "kM", "J": "kM", "m": "µm"}
 _SIZES = {"G": 1e9, "M": 1e6, "k": 1e3, "m": 1e-3, "µ": 1e-6}
 # A length is shown in metres from this size on.
-_LONG = 0.01
+_LONG = 0.1
 
 
 class Curve(NamedTuple):
@@ -68,14 +70,6 @@ def colors_of(names: Iterable[str], bodies: Sequence[str]) -> dict[str, tuple[fl
     return out | {name: left[k % len(left)] for k, name in enumerate(others)}
 
 
-def columns(panels: Sequence[Panel], x: Any, xlabel: str = "t [s]") -> "Figure":
-    """A figure of panels over one axis, in one column, or in two for many panels."""
-    figure, places = empty_panels(len(panels), xlabel)
-    for axes, panel in zip(places, panels, strict=True):
-        draw(axes, panel, x)
-    return figure
-
-
 def empty_panels(count: int, xlabel: str = "t [s]") -> tuple["Figure", list["Axes"]]:
     """A figure of empty panels over one axis."""
     across = 1 if count <= _STACKED else 2
@@ -84,6 +78,7 @@ def empty_panels(count: int, xlabel: str = "t [s]") -> tuple["Figure", list["Axe
     names = [str(k) if k < count else "." for k in range(rows * across)]
     layout: Any = [names[k : k + across] for k in range(0, rows * across, across)]
     places = list(figure.subplot_mosaic(layout, sharex=True).values())
+    places[0].locator_params(axis="x", nbins=8 if across == 1 else 5)
     for axes in places[-across:]:
         axes.set_xlabel(xlabel)
         axes.tick_params(labelbottom=True)
@@ -100,20 +95,23 @@ def draw(axes: "Axes", panel: Panel, x: Any) -> float:
 
 
 def finish_panel(axes: "Axes", label: str) -> None:
-    """Give a panel its label, a grid, and beside it a legend."""
+    """Give a panel its label, a grid and a legend."""
     axes.set_ylabel(label)
     axes.grid(alpha=0.3)
     draw_legend(axes)
 
 
 def draw_legend(axes: "Axes") -> None:
-    """A legend beside the axes, so that it hides nothing; the name of a single curve stands above."""
+    """A legend that hides nothing: a few short names stand above the axes, others beside them."""
     handles, labels = axes.get_legend_handles_labels()
-    if len(labels) == 1:
-        axes.set_title(labels[0], loc="left", fontsize="small")
-    elif labels:
-        beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.03), "borderaxespad": 0.2, "frameon": False}
-        axes.legend(handles, labels, fontsize="small", handlelength=1.6, **beside)
+    place: Any = axes.get_subplotspec()
+    if len(labels) <= _IN_ROW and sum(map(len, labels)) * place.get_gridspec().ncols <= _LETTERS:
+        outside = {"loc": "lower left", "bbox_to_anchor": (0.0, 0.98), "ncols": _IN_ROW, "columnspacing": 1.2}
+    else:
+        outside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.03)}
+    if labels:
+        options: Any = {"fontsize": "small", "handlelength": 1.6, "borderaxespad": 0.2, "frameon": False}
+        axes.legend(handles, labels, **options, **outside)
 
 
 def shown_unit(unit: str, *values: Any) -> tuple[float, str]:
@@ -131,7 +129,7 @@ def shown_unit(unit: str, *values: Any) -> tuple[float, str]:
 
 def with_unit(label: str, unit: str) -> str:
     """A label with its unit."""
-    return f"{label} [{unit}]" if unit else label
+    return label if unit in ("", "1") else f"{label} [{unit}]"
 
 
 def chosen(what: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
@@ -144,6 +142,14 @@ def chosen(what: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
         if name not in known:
             raise unknown(what, name, known, "plot")
     return list(names) or known
+
+
+def share_legends(places: Sequence["Axes"]) -> None:
+    """Remove legends beside panels in the left of two columns where the panel to the right has the same."""
+    for left, right in zip(places[::2], places[1::2], strict=False) if len(places) > _STACKED else ():
+        labels, others = (axes.get_legend_handles_labels()[1] for axes in (left, right))
+        if len(labels) > _IN_ROW and labels == others and (legend := left.get_legend()):
+            legend.remove()
 
 
 def check_single(ts: Any) -> None:

@@ -1,22 +1,19 @@
 """A fit beside its data, with residuals and bands of confidence."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..bodies.units import named
 from ..studies.identify import Identification
-from .figure import chosen, color, component, finish_panel, new_figure, shown_unit, with_unit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .figure import chosen, color, finish_panel, new_figure, shown_unit, with_unit
 
 # The largest number of rows, and the residual [σ] beyond which outliers have a ring.
 _ROWS, _FAR = 8, 5.0
 
 
-def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0.95) -> "Figure":
+def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0.95) -> Any:
     """As `Identification.plot`."""
     series = [one for one in fit.series if one.ts.size]
     if not series:
@@ -39,9 +36,8 @@ def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0
     parts = ["• measured", "– fitted"] + ([f"shaded: {level:.0%} confidence"] if bands else [])
     more = f"; {len(shown)} of {len(rows)} sensors, those with the largest residuals" if len(shown) < len(rows) else ""
     verdict = "" if fit.converged else "Not to be trusted: see fit.warnings. "
-    figure.suptitle(
-        verdict + ", ".join(parts) + more, fontsize="medium", color="black" if fit.converged else "firebrick"
-    )
+    tint = "firebrick" if verdict else "black"
+    figure.suptitle(verdict + ", ".join(parts) + more, fontsize="medium", color=tint)
     return figure
 
 
@@ -53,11 +49,8 @@ def _draw_fit(fit, axes, row, of_row, bands):
     measured = [one.predicted - one.residuals * one.sigma for one in of_row]
     factor, unit = shown_unit(own.unit, *measured)
     for k, (one, data) in enumerate(zip(of_row, measured, strict=True)):
-        label = component(one.component[0]).strip() if len(one.component) == 1 else None
         axes.plot(one.ts, factor * data, ".", color=color(k), markersize=4, alpha=0.55, markeredgewidth=0)
-        axes.plot(
-            one.ts, factor * one.predicted, color=color(k), linewidth=1.4, label=label if len(of_row) > 1 else None
-        )
+        axes.plot(one.ts, factor * one.predicted, color=color(k), linewidth=1.4, label=one.label)
         if (experiment, channel.quantity) in bands:
             ts, low, high = bands[experiment, channel.quantity]
             at = (slice(None), *one.component)
@@ -65,7 +58,6 @@ def _draw_fit(fit, axes, row, of_row, bands):
         far = np.abs(one.residuals) > _FAR if one.known else np.zeros(one.ts.shape, bool)
         axes.plot(one.ts[far], factor * data[far], "o", color="firebrick", fillstyle="none", markersize=7)
     finish_panel(axes, with_unit(own.word, unit))
-    axes.set_title(" ".join(filter(None, row)), loc="left", fontsize="small")
 
 
 def _draw_residuals(axes, of_row):
@@ -91,13 +83,10 @@ def _bands(fit, shown, level) -> dict[tuple[str, str], tuple[Any, Any, Any]]:
     out = {}
     for experiment in dict.fromkeys(experiment for experiment, _ in shown):
         channels = [_channel(fit, *row) for row in shown if row[0] == experiment]
-        plain = [own for own in channels if _is_plain(fit, own)]
+        plain = [own.quantity for own in channels if _is_plain(fit, own)]
         if plain:
-            found = fit.predict([own.quantity for own in plain], experiment=experiment, level=level)
-            out |= {
-                (experiment, own.quantity): (found.ts, found.low[own.quantity], found.high[own.quantity])
-                for own in plain
-            }
+            found = fit.predict(plain, experiment=experiment, level=level)
+            out |= {(experiment, name): (found.ts, found.low[name], found.high[name]) for name in plain}
     return out
 
 

@@ -1,24 +1,21 @@
 """The loads on a body: arrows at the worst instant, and their sizes over time."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..studies.loads import Loads
 from .figure import MOST, Curve, Panel, check_single, chosen, color, draw, new_figure, shown_unit, with_unit
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 # Arrows of forces, and moments, below this part of the largest are not drawn.
-_SMALL = 0.02
+_SMALL = 0.05
 # The longest arrow, and distances of texts, as parts of the body's size.
 _LONGEST, _BESIDE, _LINE = 0.4, 0.03, 0.07
 _BODY = "0.82"
 
 
-def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> "Figure":
+def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> Any:
     """As `Loads.plot`."""
     check_single(loads.ts)
     names, ts = chosen("load", names, loads.names), np.asarray(loads.ts)
@@ -29,7 +26,7 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> "Figure":
     colors = {int(k): color(n) for n, k in enumerate(sorted(order))}
     if t is not None and not ts.min() <= float(t) <= ts.max():
         raise ValueError(f"plot: t = {float(t):g} is not between {ts.min():g} and {ts.max():g}.")
-    worst = int(np.argmax(np.abs(ts - float(t)) * -1)) if t is not None else _worst(loads, at)
+    worst = _worst(loads, at) if t is None else int(np.argmin(np.abs(ts - float(t))))
     points = np.asarray(loads.points)[worst, at]
     figure = new_figure(9.0, 4.2 if ts.size > 1 else 4.8)
     in_plane = not (np.any(points[:, 2]) or np.any(forces[worst, :, 2]))
@@ -38,7 +35,8 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> "Figure":
     now = names, points, forces[worst], moments[worst]
     if np.ptp(points, axis=0).max() > 0:
         _arrows(axes, now, np.asarray(loads.mass_centre), colors, 2 if in_plane else 3)
-        note = "; small loads are not drawn" if len(colors) < len(names) or _any_small(forces[worst]) else ""
+        small = len(colors) < len(names) or np.any(sizes[worst] < _SMALL * sizes[worst].max())
+        note = "\nsmall loads are not drawn" if small else ""
     else:
         axes.remove()
         axes, note = figure.add_subplot(grid[:, 0]), ""
@@ -48,13 +46,13 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> "Figure":
     if ts.size > 1:
         values = ("force", "N", sizes), ("moment", "N m", np.linalg.norm(moments, axis=2))
         for row, (label, unit, of_label) in enumerate(values):
-            panel = Panel(label, unit, [Curve(names[k], of_label[:, k], colors[k]) for k in sorted(colors)])
+            # The colours of the second panel are those of the first.
+            label_of = lambda k, row=row: "_" if row else names[k]
+            panel = Panel(label, unit, [Curve(label_of(k), of_label[:, k], colors[k]) for k in sorted(colors)])
             own = figure.add_subplot(grid[row, 1])
             draw(own, panel, ts)
             own.axvline(ts[worst], color="0.4", linewidth=0.8, linestyle="--")
-            own.set_xlabel("t [s]") if row else own.tick_params(labelbottom=False)
-            if row and (legend := own.get_legend()):
-                legend.remove()
+            own.set_xlabel("t [s]" if row else "")
     return figure
 
 
@@ -62,11 +60,6 @@ def _worst(loads, at) -> int:
     """The time of the largest of these loads, but for gravity and inertia if there are others."""
     acting = [k for k in at if loads.kinds[k] not in ("gravity", "inertia")] or at
     return int(np.argmax(np.linalg.norm(np.asarray(loads.forces)[:, acting], axis=2).max(axis=1)))
-
-
-def _any_small(forces) -> bool:
-    sizes = np.linalg.norm(forces, axis=1)
-    return bool(np.any(sizes < _SMALL * sizes.max(initial=0.0)))
 
 
 def _arrows(axes, now, centre, colors, dimension):
@@ -86,7 +79,7 @@ def _arrows(axes, now, centre, colors, dimension):
         way = forces[k, :dimension] * _LONGEST * extent / max(sizes.max(), np.finfo(float).tiny)
         text = f"{names[k]} {per_force * sizes[k]:.3g} {force_unit}"
         if turn >= least:
-            text += f", {per_moment * (moments[k, 2] if dimension == 2 else turn):.3g} {moment_unit}"
+            text += f", {per_moment * (moments[k, 2] if dimension == 2 else turn):.3g} {moment_unit}".replace("-", "−")
         axes.plot(*points[k], "o", color=colors[k], markersize=5, zorder=4)
         end = points[k] + way
         if dimension == 3:
@@ -101,11 +94,7 @@ def _arrows(axes, now, centre, colors, dimension):
         written.append(place)
         sides = {"ha": "left" if way[0] >= 0 else "right", "va": "bottom" if way[1] >= 0 else "top"}
         axes.text(*place, text, color=colors[k], fontsize="small", zorder=6, **sides)
-        axes.update_datalim([end, place + np.sign(way[0]) * np.array([0.35 * extent, 0.0]), 2 * centre - centre])
-    _finish(axes, dimension)
-
-
-def _finish(axes, dimension):
+        axes.update_datalim([end, place + np.sign(way[0]) * np.array([0.35 * extent, 0.0])])
     axes.autoscale_view()
     axes.margins(0.08)
     axes.set_aspect("equal", **({"adjustable": "datalim"} if dimension == 2 else {}))

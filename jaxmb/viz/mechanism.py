@@ -14,11 +14,11 @@ from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
 from ..system import AbstractSystem
 from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
-from .figure import new_figure
+from .figure import color as color_of, new_figure
 from .meshes import heights
 from .one_motion import as_motion, check_finite, one_motion
 from .silhouettes import area, edges, stroke
-from .solids import COLORS, Placed, solids
+from .solids import Placed, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,7 +70,7 @@ def plot_mechanism(
     bodies = [name for name in picture.positions if name != GROUND]
     if len(bodies) <= _FEW:
         for k, name in enumerate(bodies):
-            path, color = picture.positions[name][:, : 2 if picture.planar else 3], faded(COLORS[k % len(COLORS)], 1.0)
+            path, color = picture.positions[name][:, : 2 if picture.planar else 3], color_of(k)
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")

@@ -11,7 +11,19 @@ from .._results import RESULTS
 from ..bodies.units import named, panel_words
 from ..parts.names import names_arguments, unknown
 from ..trajectory import Trajectory
-from .figure import MOST, STYLES, Curve, Panel, color, colors_of, component, draw, empty_panels, finish_panel
+from .figure import (
+    MOST,
+    STYLES,
+    Curve,
+    Panel,
+    color,
+    colors_of,
+    component,
+    draw,
+    empty_panels,
+    finish_panel,
+    share_legends,
+)
 from .one_motion import one_motion
 
 if TYPE_CHECKING:
@@ -71,9 +83,8 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     """
     trajectory = one_motion(trajectory, "plot_motion")
     if names is None:
-        panels = {
-            unit: _most(lines) for unit, lines in _moving(_lines(trajectory, _default(trajectory.system))).items()
-        }
+        moving = _moving(_lines(trajectory, _default(trajectory.system)))
+        panels = {unit: _most(lines) for unit, lines in moving.items()}
         checks = _CHECKS if trajectory.system.velocity_rows else _CHECKS[:1]
     else:
         given = (names,) if isinstance(names, str) else tuple(names)
@@ -87,6 +98,7 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
         draw(axes, panel, t)
     for axes, name in zip(places[len(shown) :], checks, strict=True):
         (_draw_energy if name == "energy" else _draw_residuals)(axes, t, trajectory)
+    share_legends(places)
     if not bool((trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred)):
         why = RESULTS[trajectory.result].split(".")[0]  # pyright: ignore[reportInvalidTypeArguments]
         figure.suptitle(f"The run ended at t = {t[-1]:.4g} s: {why}", fontsize="medium", color="firebrick")
@@ -233,6 +245,3 @@ def _draw_residuals(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None
     axes.semilogy(t, np.maximum(violation.position, _ROUNDING), color=color(0), label="position")
     axes.semilogy(t, np.maximum(violation.velocity, _ROUNDING), color=color(1), label="velocity [1/s]")
     finish_panel(axes, "constraint residual, scaled")
-
-
-plot = plot_motion

@@ -1,16 +1,12 @@
 """An optimisation: the objective along its iterations, parameters and outputs before and after."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..studies.optimise import Optimum
-from ..system.quantities import component_names
-from .figure import chosen, color, finish_panel, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .figure import chosen, color, components, empty_panels, finish_panel, new_figure
 
 # An objective that falls by more than this factor has a logarithmic axis; the largest number of parameters.
 _DECADES, _MOST = 30.0, 20
@@ -18,12 +14,12 @@ _DECADES, _MOST = 30.0, 20
 _BEYOND = 1.5
 
 
-def plot(best: Optimum, names: Sequence[str] = (), along: Mapping[str, Any] | None = None) -> "Figure":
+def plot(best: Optimum, names: Sequence[str] = (), along: Mapping[str, Any] | None = None) -> Any:
     """As `Optimum.plot`."""
     return _outputs(best, names, along) if names else _progress(best)
 
 
-def _progress(best) -> "Figure":
+def _progress(best) -> Any:
     """The objective and the violation of constraints along the iterations, and the parameters."""
     figure = new_figure(9.0, 4.2)
     violated = any(i.violation > 0 for i in best.iterations)
@@ -61,62 +57,39 @@ def _draw_course(axes, numbers, objective, accepted):
 
 def _parameters(axes, best):
     """Parameters at start and optimum, relative to the larger of both, with their values in words."""
-    rows = [
-        (name, float(a), float(b))
-        for key, value in best.parameters.items()
-        for name, a, b in zip(component_names(key, value.shape), best.start[key].flat, value.flat, strict=True)
-    ]
+    rows = best.components
     change = lambda row: abs(row[2] - row[1]) / (max(abs(row[1]), abs(row[2])) or 1.0)
     kept = sorted(rows, key=change)[-_MOST:]
     shown = [row for row in rows if row in kept][::-1]
     for k, (_, a, b) in enumerate(shown):
         size = max(abs(a), abs(b)) or 1.0
         axes.plot([a / size, b / size], [k, k], color="0.75", linewidth=2, zorder=1)
-        axes.plot(a / size, k, "o", color="0.55", zorder=2, label="start" if k == 0 else None)
-        axes.plot(b / size, k, "o", color=color(0), zorder=3, label="optimum" if k == 0 else None)
+        axes.plot(a / size, k, "o", color="0.55", zorder=2)
+        axes.plot(b / size, k, "o", color=color(0), zorder=3)
     axes.set_yticks(range(len(shown)), [f"{name}\n{a:.4g} → {b:.4g}" for name, a, b in shown], fontsize="small")
     axes.set_ylim(-0.6, len(shown) - 0.4)
     axes.set_xlabel("value, relative to the larger of both")
     axes.grid(alpha=0.3, axis="x")
     note = f"{len(shown)} of {len(rows)}, those that change most: " if len(shown) < len(rows) else ""
-    axes.set_title(f"{note}○ start (grey), ● optimum", fontsize="small", loc="left")
+    axes.set_title(f"{note}grey: start, blue: optimum", fontsize="small", loc="left")
 
 
-def _outputs(best, names, along) -> "Figure":
+def _outputs(best, names, along) -> Any:
     """Outputs before and after, one panel each, with bounds that are the same for all components."""
     names = chosen("output", names, best.outputs)
     ((xlabel, x),) = (along or {"component": None}).items()
-    figure = new_figure(9.0, 2.4 * len(names) + 0.6)
-    places: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    figure, places = empty_panels(len(names), xlabel)
     for axes, name in zip(places, names, strict=True):
         for label, values, of_curve in (("before", best.before[name], "0.55"), ("after", best.outputs[name], color(0))):
-            table = np.atleast_1d(values).reshape(np.size(values) if np.ndim(values) < 1 else len(values), -1)
-            ticks = np.arange(len(table)) if x is None else np.asarray(x)
-            if ticks.shape != (len(table),):
-                raise ValueError(
-                    f"plot: along must have {len(table)} values, as {name!r} has; got shape {ticks.shape}."
-                )
-            for k, column in enumerate(table.T):
-                marker = "o" if len(table) == 1 else None
-                axes.plot(
-                    ticks,
-                    column,
-                    "-" if k == 0 else "--",
-                    color=of_curve,
-                    marker=marker,
-                    label=label if k == 0 else None,
-                )
+            tables = components(label, np.atleast_1d(values))
+            ticks = np.arange(np.size(tables[0][1])) if x is None else np.asarray(x)
+            if ticks.shape != (count := tables[0][1].shape):
+                raise ValueError(f"plot: along must have shape {count}, as {name!r} has; got {ticks.shape}.")
+            for words, column, style in tables:
+                axes.plot(ticks, column, style, color=of_curve, marker=None if ticks.size > 1 else "o", label=words)
         limited = [c for c in best.constraints if c.name.split("[")[0] == name]
-        for bound in {c.low for c in limited} if len({c.low for c in limited}) == 1 else ():
-            _draw_bound(axes, bound)
-        for bound in {c.high for c in limited} if len({c.high for c in limited}) == 1 else ():
-            _draw_bound(axes, bound)
+        for bounds in ({c.low for c in limited}, {c.high for c in limited}):
+            if len(bounds) == 1 and np.isfinite(bound := bounds.pop()):
+                axes.axhline(bound, color="black", linewidth=0.9, linestyle=":")
         finish_panel(axes, name)
-    places[-1].set_xlabel(xlabel)
     return figure
-
-
-def _draw_bound(axes, bound):
-    if np.isfinite(bound):
-        labels = axes.get_legend_handles_labels()[1]
-        axes.axhline(bound, color="black", linewidth=0.9, linestyle=":", label=None if "bound" in labels else "bound")

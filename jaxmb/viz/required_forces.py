@@ -1,19 +1,16 @@
 """Forces of actuators and their powers, over time."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from ..bodies.units import effort
 from ..studies.inverse import RequiredForces
-from .figure import Curve, Panel, check_single, chosen, colors_of, columns, components
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .figure import Curve, Panel, check_single, chosen, colors_of, components, draw, empty_panels
 
 
-def plot(needed: RequiredForces, names: Sequence[str] = ()) -> "Figure":
+def plot(needed: RequiredForces, names: Sequence[str] = ()) -> Any:
     """As `RequiredForces.plot`."""
     check_single(needed.ts)
     names = chosen("actuator", names, needed.forces)
@@ -23,4 +20,8 @@ def plot(needed: RequiredForces, names: Sequence[str] = ()) -> "Figure":
         curves.setdefault(effort(needed.machine, name), []).extend(of_name)
     panels = [Panel(word, unit, of_unit) for (word, unit), of_unit in curves.items()]
     powers = [Curve(name, np.asarray(needed.power[name]), colors[name]) for name in names]
-    return columns([*panels, Panel("power into the machine", "W", powers)], needed.ts)
+    panels.append(Panel("power into the machine", "W", powers))
+    figure, places = empty_panels(len(panels))
+    for axes, panel in zip(places, panels, strict=True):
+        draw(axes, panel, needed.ts)
+    return figure

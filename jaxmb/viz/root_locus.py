@@ -64,9 +64,6 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     return figure
 
 
-plot = plot_root_locus
-
-
 def _modes(eigenvalues):
     """The eigenvalues along the parameter of each mode that does not stay at zero, conjugates together."""
     size, left, out = np.max(np.abs(eigenvalues)), list(eigenvalues.T), []

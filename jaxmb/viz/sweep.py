@@ -11,7 +11,7 @@ from .figure import MOST, color, finish_panel, new_figure, with_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The status of a member that was computed without failure, and the least number of values of a filled map.
+# The status of a member that was computed without failure.
 _OK = 1
 
 
@@ -23,7 +23,7 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
     jaxmb.viz.plot_sweep(runs, "angle", at={"time": 1.0})  # `runs` from `jaxmb.sweep`.
     ```
 
-    Members that failed are left white, and counted in the title. One dimension of parameters with one of the output,
+    Members that failed are left out, and counted in the title. One dimension of parameters with one of the output,
     such as time, gives a curve for each of at most eight values; two parameters give a map.
 
     **Arguments:** `runs`: the `xarray.Dataset` from `sweep` or `load_sweep`; `name` of the output; `at`: values of
@@ -34,45 +34,41 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
     **Raises:** `ValueError` for unknown names, and for more or fewer than one or two dimensions; `ImportError` without
     matplotlib.
     """
+    if "status" not in runs:
+        raise ValueError("plot_sweep shows a result of sweep or load_sweep, and this has no status of its members.")
     outputs = [key for key in runs.data_vars if key not in ("status", "message", "num_steps")]
     if name not in outputs:
         raise unknown("output", name, outputs, "plot_sweep")
-    values, failed = runs[name], 0
-    if "status" in runs:
-        failed = int((runs["status"] != _OK).sum())
-        values = values.where(runs["status"] == _OK)
-    held = []
+    bad, held = runs["status"] != _OK, []
+    values = runs[name].where(~bad)
     for dimension, number in (at or {}).items():
         if dimension not in values.dims:
             raise unknown("dimension", dimension, values.dims, "plot_sweep: at")
         values = values.sel({dimension: number}, method="nearest")
+        bad = bad.sel({dimension: number}, method="nearest") if dimension in bad.dims else bad
         held.append(f"{dimension} = {float(values[dimension]):.4g}")
     if values.ndim not in (1, 2):
         raise ValueError(
             f"plot_sweep shows one or two dimensions, and {name!r} has {', '.join(map(str, values.dims)) or 'none'}; "
             "hold some by at={dimension: value}."
         )
-    own = [str(dimension) for dimension in values.dims if dimension in runs["status"].dims] if "status" in runs else []
-    is_map = values.ndim == 2 and len(own) == 2
+    is_map = values.ndim == 2 == sum(dimension in bad.dims for dimension in values.dims)
     figure = new_figure(9.0, 4.2 if is_map else 3.4)
     axes = figure.add_subplot()
-    (_map if is_map else _curves)(figure, axes, values)
-    note = f"{failed} of {runs['status'].size} members failed" if failed else ""
-    title = "; ".join(filter(None, (", ".join(held), note)))
-    axes.set_title(title, fontsize="medium")
+    (_map if is_map else _curves)(axes, values)
+    failed = f"{int(bad.sum())} of {bad.size} members failed and are left out" if bad.any() else ""
+    figure.suptitle("; ".join(filter(None, (", ".join(held), failed))), fontsize="medium")
     return figure
-
-
-plot = plot_sweep
 
 
 def _label(values) -> str:
     return with_unit(str(values.name), values.attrs.get("units", ""))
 
 
-def _curves(figure, axes, values):
+def _curves(axes, values):
     """One curve, or one for each of a few values of the first dimension, along the last."""
-    del figure
+    from matplotlib import colormaps
+
     last = values[values.dims[-1]]
     if values.ndim == 1:
         axes.plot(last, values, ".-", color=color(0), markersize=4)
@@ -80,15 +76,16 @@ def _curves(figure, axes, values):
         first = values[values.dims[0]]
         shown = np.unique(np.linspace(0, first.size - 1, min(first.size, MOST)).round().astype(int))
         for n, k in enumerate(shown):
-            axes.plot(last, values[k], color=color(n), label=f"{first.name} {float(first[k]):.4g}")
+            label = f"{first.name} = {float(first[k]):.4g} {first.attrs.get('units', '')}"
+            axes.plot(last, values[k], color=colormaps["viridis"](0.9 * n / shown.size), label=label)
     axes.set_xlabel(_label(last))
     finish_panel(axes, _label(values))
 
 
-def _map(figure, axes, values):
+def _map(axes, values):
     """Colours over two dimensions, the first to the right."""
     right, up = (values[dimension] for dimension in values.dims)
     mesh = axes.pcolormesh(right, up, np.asarray(values).T, shading="nearest", cmap="viridis", rasterized=True)
-    figure.colorbar(mesh, ax=axes, label=_label(values))
+    axes.figure.colorbar(mesh, ax=axes, label=_label(values))
     axes.set_xlabel(_label(right))
     axes.set_ylabel(_label(up))

@@ -164,7 +164,7 @@ class Identification(Printed, Fit):
 
         **Raises:** `ValueError` for an unknown sensor and for a residual function; `ImportError` without matplotlib.
         """
-        return picture("identification", self, sensors, level)
+        return picture("identification.plot", self, sensors, level)
 
     def to_pandas(self) -> Any:
         """A `pandas.DataFrame` with a row for each component: `start`, `estimate`, `deviation` and the `reason` for a

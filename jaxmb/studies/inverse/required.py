@@ -89,7 +89,7 @@ class RequiredForces(eqx.Module):
 
         **Raises:** `ValueError` for an unknown name and a batch; `ImportError` without matplotlib.
         """
-        return picture("required_forces", self, names)
+        return picture("required_forces.plot", self, names)
 
     def to_pandas(self) -> Any:
         """A `pandas.DataFrame` with the column `t` [s], the force of each actuator by its name, of a vector

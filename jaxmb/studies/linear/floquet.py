@@ -74,7 +74,7 @@ class Floquet(eqx.Module):
 
         **Raises:** `ValueError` for a batch; `ImportError` without matplotlib.
         """
-        return picture("floquet", self)
+        return picture("small_motions.floquet", self)
 
     def __repr__(self) -> str:
         return f"Floquet: {len(self.states)} states over one period"

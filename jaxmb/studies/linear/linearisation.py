@@ -175,7 +175,7 @@ class Linearisation(eqx.Module):
         **Raises:** `ValueError` for unknown names, more than eight responses and a batch; `ImportError` without
         matplotlib.
         """
-        return picture("linearisation", self, inputs, outputs, omega)
+        return picture("small_motions.linearisation", self, inputs, outputs, omega)
 
     def to_scipy(self) -> Any:
         """These equations as a `scipy.signal.StateSpace`, without names.

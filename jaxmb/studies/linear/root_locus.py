@@ -45,7 +45,7 @@ class RootLocus(eqx.Module):
 
     def plot(self, labels: Sequence[str] = ()) -> "Figure":
         """Draw the eigenvalues, as `viz.plot_root_locus`, with `labels` of the modes."""
-        return picture("root_locus", self, labels)
+        return picture("root_locus.plot_root_locus", self, labels)
 
     def stable(self, least: float = 1e-6) -> np.ndarray:
         """At each value, whether no eigenvalue has a real part above `least` times the largest eigenvalue's size."""

@@ -114,6 +114,15 @@ class Optimum(Printed):
     message: str
     derivatives: str
 
+    @property
+    def components(self) -> list[tuple[str, float, float]]:
+        """The components of the parameters: their names, and their values at start and optimum."""
+        return [
+            (name, float(a), float(b))
+            for key, value in self.parameters.items()
+            for name, a, b in zip(component_names(key, value.shape), self.start[key].flat, value.flat, strict=True)
+        ]
+
     def plot(self, *outputs: str, along: Mapping[str, Any] | None = None) -> "Figure":
         """Plot the objective along the iterations, and the parameters before and after; or outputs before and after.
 
@@ -124,20 +133,16 @@ class Optimum(Printed):
 
         **Raises:** `ValueError` for an unknown output, and values of another number; `ImportError` without matplotlib.
         """
-        return picture("optimum", self, outputs, along)
+        return picture("optimum.plot", self, outputs, along)
 
     def to_pandas(self) -> Any:
         """A `pandas.DataFrame` with a row for each component of the parameters: `start` and `optimum`.
 
         **Raises:** `ImportError` without pandas.
         """
-        rows = {
-            name: (float(a), float(b))
-            for key, value in self.parameters.items()
-            for name, a, b in zip(component_names(key, value.shape), self.start[key].flat, value.flat, strict=True)
-        }
+        names, *numbers = zip(*self.components, strict=True)
         frame = package_for_tables("pandas", "pandas").DataFrame
-        return frame(list(rows.values()), index=list(rows), columns=["start", "optimum"])
+        return frame(dict(zip(("start", "optimum"), numbers, strict=True)), index=list(names))
 
     def __repr__(self) -> str:
         return f"Optimum: objective {self.objective:.6g}, {self.message}"
@@ -145,9 +150,7 @@ class Optimum(Printed):
     def __str__(self) -> str:
         numbers = lambda *given: tuple(f"{float(x):.6g}" for x in given)
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
-        for name, value in self.parameters.items():
-            each = zip(component_names(name, value.shape), self.start[name].flat, value.flat, strict=True)
-            rows += [(word, *numbers(a, b)) for word, a, b in each]
+        rows += [(word, *numbers(a, b)) for word, a, b in self.components]
         rows += [(), ("output", "before", "after")]
         rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:

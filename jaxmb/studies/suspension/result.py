@@ -79,7 +79,7 @@ class KinematicsAndCompliance(Printed, eqx.Module):
 
         **Raises:** `ValueError` for unknown names, and for a single position; `ImportError` without matplotlib.
         """
-        return picture("suspension", self, names)
+        return picture("suspension.plot", self, names)
 
     def __str__(self) -> str:
         how = f"static equilibria in {self.freedoms} freedoms" if self.freedoms else "kinematics"
