@@ -57,10 +57,10 @@ def named(system: Any, quantity: str) -> Named:
         word, unit = "force of the drive", unit_along(system, part)
     elif not field:
         word, unit = "coordinate", ""
-    elif kind in _WORDS:
-        word, unit = _WORDS[kind]
     else:
-        word, unit = field.replace("_", " "), declared_unit(system, part, field)
+        word, unit = _WORDS.get(kind, (field.replace("_", " "), ""))
+        # Of an internal state of this name, such as the force of a motor.
+        unit = declared_unit(system, part, field) or unit
     if order:
         word, unit = _RATES[unit][order - 1] if unit in _RATES else (f"{word}, rate", f"{unit}/s")
     return Named(part, field, word, unit)

@@ -66,7 +66,8 @@ def test_plot_motion_shows_quantities_by_name(piston):
     assert [list(drawn(axes)) for axes in of_piston] == [["piston x", "piston y"]] * 2 + [["piston"]] * 2
     assert list(drawn(energy)) == ["kinetic", "potential", "sum"]
     (one,) = (figure := viz.plot_motion(piston, "slide.displacement")).axes
-    np.testing.assert_allclose(drawn(one)["slide"], 0.1 * np.sin(TS), atol=1e-15)
+    assert one.get_ylabel() == "displacement [mm]"
+    np.testing.assert_allclose(drawn(one)["slide"], 100.0 * np.sin(TS), atol=1e-12)
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
