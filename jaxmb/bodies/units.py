@@ -53,6 +53,8 @@ def named(system: Any, quantity: str) -> Named:
     if field and not system.body_names:
         # Generalized forces of coordinates with several units.
         word, unit = field, ""
+    elif field == "gap":
+        word, unit = "gap", "rad" if unit_along(system, part) == "N m" else "m"
     elif field == "drive_force":
         word, unit = "force of the drive", unit_along(system, part)
     elif not field:

@@ -132,12 +132,12 @@ def with_unit(label: str, unit: str) -> str:
     return label if unit in ("", "1") else f"{label} [{unit}]"
 
 
-def chosen(what: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
+def chosen(what: str, names: str | Sequence[str], known: Iterable[str]) -> list[str]:
     """The names that a picture shows, default all.
 
     **Raises:** `ValueError` with the nearest names for an unknown name.
     """
-    known = list(known)
+    names, known = (names,) if isinstance(names, str) else names, list(known)
     for name in names:
         if name not in known:
             raise unknown(what, name, known, "plot")

@@ -26,7 +26,9 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> Any:
     colors = {int(k): color(n) for n, k in enumerate(sorted(order))}
     if t is not None and not ts.min() <= float(t) <= ts.max():
         raise ValueError(f"plot: t = {float(t):g} is not between {ts.min():g} and {ts.max():g}.")
-    worst = _worst(loads, at) if t is None else int(np.argmin(np.abs(ts - float(t))))
+    # The largest force but for gravity and inertia, if there are others.
+    acting = [k for k in range(len(at)) if loads.kinds[at[k]] not in ("gravity", "inertia")] or list(range(len(at)))
+    worst = int(np.argmax(sizes[:, acting].max(axis=1)) if t is None else np.argmin(np.abs(ts - float(t))))
     points = np.asarray(loads.points)[worst, at]
     figure = new_figure(9.0, 4.2 if ts.size > 1 else 4.8)
     in_plane = not (np.any(points[:, 2]) or np.any(forces[worst, :, 2]))
@@ -41,8 +43,10 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> Any:
         axes.remove()
         axes, note = figure.add_subplot(grid[:, 0]), ""
         _bars(axes, names, sizes[worst], colors)
-    instant = "largest loads" if t is None and ts.size > 1 else "loads"
-    axes.set_title(f"{instant} on {loads.body}, at t = {ts[worst]:.4g} s{note}", fontsize="medium")
+    axes.set_title(
+        f"{'largest ' * (t is None and ts.size > 1)}loads on {loads.body}, at t = {ts[worst]:.4g} s{note}",
+        fontsize="medium",
+    )
     if ts.size > 1:
         values = ("force", "N", sizes), ("moment", "N m", np.linalg.norm(moments, axis=2))
         for row, (label, unit, of_label) in enumerate(values):
@@ -54,12 +58,6 @@ def plot(loads: Loads, names: Sequence[str] = (), t: Any = None) -> Any:
             own.axvline(ts[worst], color="0.4", linewidth=0.8, linestyle="--")
             own.set_xlabel("t [s]" if row else "")
     return figure
-
-
-def _worst(loads, at) -> int:
-    """The time of the largest of these loads, but for gravity and inertia if there are others."""
-    acting = [k for k in at if loads.kinds[k] not in ("gravity", "inertia")] or at
-    return int(np.argmax(np.linalg.norm(np.asarray(loads.forces)[:, acting], axis=2).max(axis=1)))
 
 
 def _arrows(axes, now, centre, colors, dimension):

@@ -1,22 +1,20 @@
 """An optimisation: the objective along its iterations, parameters and outputs before and after."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..studies.optimise import Optimum
-from .figure import chosen, color, components, empty_panels, finish_panel, new_figure
+from .figure import chosen, color, components, empty_panels, finish_panel, new_figure, shown_unit, with_unit
 
 # An objective that falls by more than this factor has a logarithmic axis; the largest number of parameters.
 _DECADES, _MOST = 30.0, 20
-# Trials that raise the objective by more than this part of its range are beyond the picture.
-_BEYOND = 1.5
 
 
-def plot(best: Optimum, names: Sequence[str] = (), along: Mapping[str, Any] | None = None) -> Any:
+def plot(best: Optimum, names: Sequence[str] = (), along: Any = None, units: Any = None) -> Any:
     """As `Optimum.plot`."""
-    return _outputs(best, names, along) if names else _progress(best)
+    return _outputs(best, names, along, units or {}) if names else _progress(best)
 
 
 def _progress(best) -> Any:
@@ -26,9 +24,8 @@ def _progress(best) -> Any:
     sides: Any = figure.subfigures(1, 2, width_ratios=(1.1, 1))
     left, right = sides
     places: Any = left.subplots(1 + violated, 1, sharex=True, squeeze=False)[:, 0]
-    numbers = np.array([i.number for i in best.iterations])
-    objective = np.array([i.objective for i in best.iterations])
-    accepted = np.array([i.accepted for i in best.iterations], bool)
+    log = [(i.number, i.objective, i.accepted) for i in best.iterations] or [(0, best.objective, True)]
+    numbers, objective, accepted = (np.array(column) for column in zip(*log, strict=True))
     _draw_course(places[0], numbers, objective, accepted)
     places[0].axhline(best.objective, color="0.4", linewidth=0.8, linestyle="--")
     finish_panel(places[0], "objective")
@@ -44,15 +41,13 @@ def _progress(best) -> Any:
 
 
 def _draw_course(axes, numbers, objective, accepted):
-    """Accepted iterations as a line with dots, others as rings, unless they leave the picture."""
+    """Accepted iterations as a line with dots, others as rings."""
     axes.plot(numbers[accepted], objective[accepted], "o-", color=color(0), markersize=4, label="best so far")
     if not accepted.all():
         axes.plot(numbers[~accepted], objective[~accepted], "o", color="0.6", fillstyle="none", label="tried")
     low, high = objective[accepted].min(initial=np.inf), objective[accepted].max(initial=-np.inf)
     if low > 0 and high > _DECADES * low:
         axes.set_yscale("log")
-    elif objective.size and objective.max() > high + _BEYOND * (high - low) > high:
-        axes.set_ylim(low - 0.1 * (high - low), high + _BEYOND * (high - low))
 
 
 def _parameters(axes, best):
@@ -74,14 +69,15 @@ def _parameters(axes, best):
     axes.set_title(f"{note}grey: start, blue: optimum", fontsize="small", loc="left")
 
 
-def _outputs(best, names, along) -> Any:
+def _outputs(best, names, along, units) -> Any:
     """Outputs before and after, one panel each, with bounds that are the same for all components."""
     names = chosen("output", names, best.outputs)
     ((xlabel, x),) = (along or {"component": None}).items()
     figure, places = empty_panels(len(names), xlabel)
     for axes, name in zip(places, names, strict=True):
+        factor, unit = shown_unit(units.get(name, ""), best.before[name], best.outputs[name])
         for label, values, of_curve in (("before", best.before[name], "0.55"), ("after", best.outputs[name], color(0))):
-            tables = components(label, np.atleast_1d(values))
+            tables = components(label, factor * np.atleast_1d(values))
             ticks = np.arange(np.size(tables[0][1])) if x is None else np.asarray(x)
             if ticks.shape != (count := tables[0][1].shape):
                 raise ValueError(f"plot: along must have shape {count}, as {name!r} has; got {ticks.shape}.")
@@ -90,6 +86,6 @@ def _outputs(best, names, along) -> Any:
         limited = [c for c in best.constraints if c.name.split("[")[0] == name]
         for bounds in ({c.low for c in limited}, {c.high for c in limited}):
             if len(bounds) == 1 and np.isfinite(bound := bounds.pop()):
-                axes.axhline(bound, color="black", linewidth=0.9, linestyle=":")
-        finish_panel(axes, name)
+                axes.axhline(factor * bound, color="black", linewidth=0.9, linestyle=":")
+        finish_panel(axes, with_unit(name, unit))
     return figure

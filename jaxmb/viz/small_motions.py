@@ -26,8 +26,6 @@ def linearisation(
 ) -> Any:
     """As `Linearisation.plot`."""
     check_single(linear.A[..., 0])
-    several = lambda names: (names,) if isinstance(names, str) else tuple(names)
-    inputs, outputs = several(inputs), several(outputs)
     if not (linear.inputs and linear.outputs) and not inputs and not outputs:
         return _eigenvalues(linear)
     pairs = [(i, o) for i in chosen("input", inputs, linear.inputs) for o in chosen("output", outputs, linear.outputs)]
@@ -49,18 +47,11 @@ def linearisation(
     is_known = len(per) == 1 and not any(x.startswith("/") or "()" in x for x in per)
     finish_panel(gain, f"gain [{per.pop()}]" if is_known else "gain, SI units")
     finish_panel(phase, "phase [°]")
-    phase.yaxis.set_major_locator(_degrees(phase))
+    low, high = phase.get_ylim()
+    step = next(step for step in (15.0, 45.0, 90.0, 180.0, 360.0) if high - low <= 8 * step or step == 360)
+    phase.set_yticks(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
     phase.set_xlabel("ω [rad/s]")
     return figure
-
-
-def _degrees(axes) -> Any:
-    from matplotlib.ticker import MultipleLocator
-
-    low, high = axes.get_ylim()
-    return MultipleLocator(
-        next(step for step in (15.0, 45.0, 90.0, 180.0, 360.0) if high - low <= 8 * step or step == 360)
-    )
 
 
 def _eigenvalues(linear) -> Any:
@@ -102,11 +93,8 @@ def floquet(periodic: Floquet) -> Any:
     outside = np.abs(values) > 1 + _ROUNDING
     for kind, these, k in (("stable", ~outside, 0), ("unstable", outside, 1)):
         if these.any():
-            label = f"{kind}, {int(these.sum())} multipliers" if these.sum() > 1 else kind
+            label = f"{kind}: {int(these.sum())}, |μ| up to {np.abs(values[these]).max():.4g}"
             axes.plot(values.real[these], values.imag[these], "os"[k], color=color(k), label=label, zorder=3)
-    for value in values[outside]:
-        place = {"xytext": (6, 6), "textcoords": "offset points", "fontsize": "small"}
-        axes.annotate(f"{abs(value):.3g}", (value.real, value.imag), **place)
     axes.set(xlabel="Re μ", ylabel="Im μ", aspect="equal")
     axes.locator_params(nbins=5)
     axes.set_title(f"Floquet multipliers, period {float(periodic.period):.4g} s", fontsize="medium")

@@ -37,8 +37,7 @@ def plot(curves: KinematicsAndCompliance, names: Sequence[str] = ()) -> Any:
     steer = None if curves.steer is None else np.asarray(curves.steer)
     if not travel.ndim and (steer is None or not steer.ndim):
         raise ValueError("plot needs several values of travel or of steer; this is one position, which print shows.")
-    across = min(_ACROSS, len(names))
-    rows = -(-len(names) // across)
+    rows, across = -(-len(names) // _ACROSS), min(_ACROSS, len(names))
     figure = new_figure(9.0, 2.9 * rows + 0.5)
     places: Any = figure.subplots(rows, across, sharey=True, squeeze=False).ravel()
     for axes in places[len(names) :]:

@@ -23,8 +23,8 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
     jaxmb.viz.plot_sweep(runs, "angle", at={"time": 1.0})  # `runs` from `jaxmb.sweep`.
     ```
 
-    Members that failed are left out, and counted in the title. One dimension of parameters with one of the output,
-    such as time, gives a curve for each of at most eight values; two parameters give a map.
+    One parameter with a dimension of the output, such as time, gives a curve for each of at most eight values; two
+    parameters give a map. Members that failed are left out, and counted in the title.
 
     **Arguments:** `runs`: the `xarray.Dataset` from `sweep` or `load_sweep`; `name` of the output; `at`: values of
     dimensions that are held, each at the nearest value of the grid.
@@ -87,5 +87,4 @@ def _map(axes, values):
     right, up = (values[dimension] for dimension in values.dims)
     mesh = axes.pcolormesh(right, up, np.asarray(values).T, shading="nearest", cmap="viridis", rasterized=True)
     axes.figure.colorbar(mesh, ax=axes, label=_label(values))
-    axes.set_xlabel(_label(right))
-    axes.set_ylabel(_label(up))
+    axes.set(xlabel=_label(right), ylabel=_label(up))

@@ -70,6 +70,7 @@ AFTER = {
     "robust": "optimise",
     "Floquet": "floquet",
     "viz.plot_root_locus": "root_locus",
+    "viz.plot_sweep": "sweep",
 }
 # What examples refer to besides.
 BEFORE = {
@@ -194,7 +195,8 @@ LONG = (
     *("kinematics_and_compliance", "required_forces", "KinematicsAndCompliance", "RequiredForces", "Servo"),
     *("formulations.Partitioned", "lagrangian.QuasiVelocities", "formulations.accelerations", "system"),
     *("lagrangian.LagrangianSystem", "spatial.MagicFormulaTyre", "assembly_gap", "planar.Friction", "modules"),
-    *("solvers.integrate", "JointCoupling", "smooth_step", "Trajectory.end", "evaluate"),
+    *("solvers.integrate", "JointCoupling", "smooth_step", "Trajectory.end", "evaluate", "viz.plot_sweep"),
+    *("Trajectory.plot", "Loads"),
 )
 
 

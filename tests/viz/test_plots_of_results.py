@@ -387,7 +387,7 @@ def test_multipliers_and_locus(monkeypatch):
     monkeypatch.setattr(mb.Floquet, "multipliers", property(lambda self: np.linalg.eigvals(self.monodromy)))
     periodic = mb.Floquet(np.diag([1.5, 0.5]), ("a", "a_rate"), 1, np.zeros((2, 2)), np.array(2.0))
     (plane,) = periodic.plot().axes
-    found = {line.get_label(): line.get_xdata() for line in plane.lines}
+    found = {line.get_label().split(":")[0]: line.get_xdata() for line in plane.lines}
     np.testing.assert_allclose(found["stable"], [0.5])
     np.testing.assert_allclose(found["unstable"], [1.5])
     values = np.array([[-1.0 + 2j, -1.0 - 2j], [0.5 + 2j, 0.5 - 2j]])

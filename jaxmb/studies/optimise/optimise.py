@@ -123,17 +123,20 @@ class Optimum(Printed):
             for name, a, b in zip(component_names(key, value.shape), self.start[key].flat, value.flat, strict=True)
         ]
 
-    def plot(self, *outputs: str, along: Mapping[str, Any] | None = None) -> "Figure":
+    def plot(
+        self, *outputs: str, along: Mapping[str, Any] | None = None, units: Mapping[str, str] | None = None
+    ) -> "Figure":
         """Plot the objective along the iterations, and the parameters before and after; or outputs before and after.
 
         **Arguments:** `outputs` by name, to show instead; `along`: the label and the values of their horizontal axis,
-        `{"t [s]": ts}`, default the numbers of the components. Bounds that hold for all components are dotted lines.
+        `{"t [s]": ts}`, default the numbers of the components; `units` of outputs by name. Bounds that hold for all
+        components are dotted lines.
 
         **Returns:** a matplotlib `Figure`. Parameters are drawn relative to the larger of start and optimum.
 
         **Raises:** `ValueError` for an unknown output, and values of another number; `ImportError` without matplotlib.
         """
-        return picture("optimum.plot", self, outputs, along)
+        return picture("optimum.plot", self, outputs, along, units)
 
     def to_pandas(self) -> Any:
         """A `pandas.DataFrame` with a row for each component of the parameters: `start` and `optimum`.
