@@ -113,10 +113,10 @@ def _default(system) -> list[str]:
     quantities = system.quantities()
     # In space a body has no angle: angles of joints are shown.
     flat = any(f"{name}.angle" in quantities for name in system.catalogue.motion_names())
-    units = ("m",) if flat else ("m", "rad")
+    words = ("displacement",) if flat else ("angle", "displacement")
     of_bodies = _quantities(system, system.catalogue.motion_names())
     of_bodies = [name for name in of_bodies if flat or named(system, name).unit != "rad/s"]
-    of_joints = [name for name in system.joint_coordinates() if named(system, name).unit in units]
+    of_joints = [name for name in system.joint_coordinates() if named(system, name).word in words]
     return [*of_bodies, *(x for name in of_joints for x in (name, f"{name}_rate"))]
 
 
