@@ -5,7 +5,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._arguments import package_for_tables
 from ._compat import changed, steps_of
+from ._pictured import picture
 from ._results import RESULTS
 from ._types import Scalar, State
 from .contacts.events import ContactEvents, FoundEvents, contact_events
@@ -36,6 +37,9 @@ from .system import AbstractSystem
 from .system.instant import Instant
 from .system.picture import Picture, joined_pictures
 from .system.quantities import Reaction, Solved, with_shapes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class ConstraintViolation(NamedTuple):
@@ -638,6 +642,19 @@ class Trajectory(eqx.Module):
         if "energy" in names:
             values["energy"] = self.energy
         return {name: np.asarray(values[name]) for name in names}
+
+    def plot(self, *names: str) -> "Figure":
+        """Plot quantities by name against time, as `viz.plot_motion`; without names the energy and what moves most.
+
+        ```python
+        motion.plot("bar.angle", "pin.force", "energy")
+        ```
+
+        **Returns:** a matplotlib `Figure` with a panel for each unit.
+
+        **Raises:** `ValueError` for an unknown name, a batch or fewer than two times; `ImportError` without matplotlib.
+        """
+        return picture("motion.plot_motion", self, names or None)
 
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as a compressed `.npz`.

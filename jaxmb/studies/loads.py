@@ -4,7 +4,7 @@ import csv
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._arguments import check_kind
+from .._arguments import check_kind, package_for_tables
+from .._pictured import picture
 from .._printed import Printed
 from ..linalg.arrays import add_up, is_traced
 from ..linalg.jitted import jitted
@@ -25,6 +26,9 @@ from ..system.instant import Instant
 from ..trajectory import Trajectory
 from .inverse.drives import Drive, drives_of
 from .inverse.required import RequiredForces
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Forces that differ by this part of them are equal.
 _ROUNDING = 1e-9
@@ -52,6 +56,7 @@ class Loads(Printed, eqx.Module):
     largest = jnp.max(jaxmb.rotations.norm(pin.force))
     worst = on_bar.worst(lambda on_bar: jaxmb.rotations.norm(on_bar["pin"].force), count=3)
     worst.to_csv("bar.csv")
+    on_bar.plot().savefig("bar.png")
     ```
 
     **Fields:** the `body`; `names` and `kinds` of its loads: "joint", also of a rigid stop or rope, "contact" of bodies
@@ -102,20 +107,48 @@ class Loads(Printed, eqx.Module):
         acting = np.array([kind not in ("gravity", "inertia") for kind in self.kinds])
         return jnp.max(jnp.where(acting, norm(self.forces), 0.0), axis=1)
 
+    def plot(self, *names: str, t: float | None = None) -> "Figure":
+        """Draw the loads on the body, in its axes, as arrows with their sizes, and plot the sizes against time.
+
+        The moments beside the arrows are about the points of application; in the plane they are positive to the left.
+        Loads that act at a single point are bars.
+
+        **Arguments:** `names` of loads, default the eight largest; `t`: the time of the arrows [s], default the time of
+        the largest force but for gravity and inertia.
+
+        **Returns:** a matplotlib `Figure`; large forces are in kN.
+
+        **Raises:** `ValueError` for an unknown name, a time outside of the motion and a batch; `ImportError` without
+        matplotlib.
+        """
+        return picture("loads.plot", self, names, t)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each time and load, and the columns of `to_csv`.
+
+        **Raises:** `ImportError` without pandas.
+        """
+        return package_for_tables("pandas", "pandas").DataFrame(self._table(), columns=list(_COLUMNS))
+
+    def _table(self) -> list[list[Any]]:
+        """The rows of a table, one for each time and load."""
+        numbers = np.concatenate([self.points, self.forces, self.moments], axis=2)
+        return [
+            [float(t), name, *map(float, row)]
+            for t, of_time in zip(np.asarray(self.ts), numbers, strict=True)
+            for name, row in zip(self.names, of_time, strict=True)
+        ]
+
     def to_csv(self, file: str | Path) -> None:
         """Write a CSV file, as finite-element programs read it, with a row for each time and load.
 
         The columns are time [s], part, point_x, point_y, point_z [m], force_x, force_y, force_z [N], moment_x, moment_y
         and moment_z [N m]. All vectors are in body axes; points are in the body's frame, and moments about the point.
         """
-        rows = np.concatenate([self.points, self.forces, self.moments], axis=2)
         with Path(file).open("w", newline="", encoding="utf-8") as opened:
             writer = csv.writer(opened)
             writer.writerow(_COLUMNS)
-            for t, of_time in zip(np.asarray(self.ts), rows, strict=True):
-                writer.writerows(
-                    [float(t), name, *map(float, row)] for name, row in zip(self.names, of_time, strict=True)
-                )
+            writer.writerows(self._table())
 
     def __str__(self) -> str:
         if is_traced((self.ts, self.forces)) or not self.ts.size:

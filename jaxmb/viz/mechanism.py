@@ -11,14 +11,15 @@ from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
 from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
+from ..studies.inverse import RequiredForces
 from ..system import AbstractSystem
 from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
-from .figure import new_figure
+from .figure import color as color_of, new_figure
 from .meshes import heights
-from .one_motion import as_motion, check_finite, one_motion
+from .one_motion import check_finite, one_motion, poses_of
 from .silhouettes import area, edges, stroke
-from .solids import COLORS, Placed, solids
+from .solids import Placed, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +32,7 @@ _EDGE: Color = (40, 40, 40)
 
 
 def plot_mechanism(
-    trajectory: Trajectory | State, frames: int = 5, *, system: AbstractSystem | None = None
+    trajectory: Trajectory | RequiredForces | State, frames: int = 5, *, system: AbstractSystem | None = None
 ) -> "Figure":
     """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres; or
     at one state.
@@ -45,7 +46,7 @@ def plot_mechanism(
     mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
     the terrain. Up to 8 bodies have paths and a legend.
 
-    **Arguments:** `trajectory`: a motion of a planar or spatial scene, or a `State`, with its `system`; `frames`: the
+    **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State`, with its `system`; `frames`: the
     number of poses, at least 1.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
@@ -54,7 +55,7 @@ def plot_mechanism(
     **Raises:** `ValueError` for `frames < 1`, a batch, states that are not finite, and a system without bodies;
     `ImportError` without matplotlib.
     """
-    frames, trajectory = whole_number("frames", frames), as_motion(trajectory, system)
+    frames, trajectory = whole_number("frames", frames), poses_of(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "
@@ -70,7 +71,7 @@ def plot_mechanism(
     bodies = [name for name in picture.positions if name != GROUND]
     if len(bodies) <= _FEW:
         for k, name in enumerate(bodies):
-            path, color = picture.positions[name][:, : 2 if picture.planar else 3], faded(COLORS[k % len(COLORS)], 1.0)
+            path, color = picture.positions[name][:, : 2 if picture.planar else 3], color_of(k)
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")

@@ -1,47 +1,42 @@
 """Time histories of a motion."""
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from .._results import RESULTS
+from ..bodies.units import named, panel_words
 from ..parts.names import names_arguments, unknown
 from ..trajectory import Trajectory
-from .figure import new_figure
+from .figure import (
+    MOST,
+    STYLES,
+    Curve,
+    Panel,
+    color,
+    colors_of,
+    component,
+    draw,
+    empty_panels,
+    finish_panel,
+    share_legends,
+)
 from .one_motion import one_motion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Largest number of lines with a legend.
-_LEGEND = 8
 # A residual of exactly zero has no logarithm.
 _ROUNDING = 1e-17
 # Components that vary by less than this, relative to the largest value of their kind, are at rest.
 _STILL = 1e-9
-
-# The kinds of quantities in the order of their panels, with the panels' labels; each kind is followed by its rate.
-_LABELS = {
-    "position": "position [m]",
-    "velocity": "velocity [m/s]",
-    "angle": "angle [rad]",
-    "angular_velocity": "angular velocity [rad/s]",
-    "displacement": "displacement [m]",
-    "displacement_rate": "rate of displacement [m/s]",
-    "coordinate": "coordinate",
-    "rate": "rate of the coordinate",
-    "acceleration": "acceleration [m/s²]",
-    "angular_acceleration": "angular acceleration [rad/s²]",
-    "specific_force": "specific force [m/s²]",
-    "force": "force [N]",
-    "moment": "moment [N m]",
-}
-_WITH_RATES = ("position", "angle", "displacement", "coordinate")
-_RATES = dict(zip(_LABELS, list(_LABELS)[1:], strict=False))
-# The coordinates of joints with several angles.
-_ANGLES = ("angle_a", "angle_b", "angle_1", "angle_2", "angle_3")
+# The order of panels.
+_UNITS = ("m", "m/s", "rad", "rad/s", "coordinate", "rate of the coordinate", "m/s²", "rad/s²", "N", "N m")
+_RATE_OF = {"m/s": "m", "rad/s": "rad", "rate of the coordinate": "coordinate"}
 _CHECKS = ("energy", "residuals")
 
 
@@ -51,54 +46,62 @@ class _Line(NamedTuple):
     name: str
     component: int | None
     values: Float[np.ndarray, "times"]
+    quantity: str
 
 
 @names_arguments
 def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None) -> "Figure":
-    """Plot a motion against time.
+    """Plot a motion against time; `motion.plot("bar.angle", "energy")` is the same.
 
     ```python
     jaxmb.viz.plot_motion(motion, ["bar.angle", "pin.force", "energy"]).savefig("motion.png")
     ```
 
-    By default the energy, the residuals of constraints and all moving quantities are shown:
+    By default the energy, the residuals of constraints and moving quantities are shown:
 
     - positions and velocities of mass centres; displacements of sliding joints;
     - angles and angular velocities, of bodies in the plane and of joints in space;
     - the coordinates of a system without bodies and their rates q̇.
 
-    A constant component, such as the height of a trolley on a level rail, is left out. Events of contacts and dry
-    friction are vertical lines, solid at impacts, dotted without an impulse.
+    A constant component, such as the height of a trolley on a level rail, is left out; of many curves in a panel, the
+    parts that move most are shown. Events of contacts and dry friction are vertical lines, solid at impacts, dotted
+    without an impulse.
 
     **Arguments:**
 
     - `trajectory`: a motion saved at several times.
-    - `names` of quantities to show instead, such as `"piston.position"`, `"slide.displacement"`, `"hip.angle_rate"`,
-        `"A.force"`, `"energy"` and `"residuals"`. The name of a body, joint, frame or part with internal states selects
-        all quantities of its motion.
+    - `names` of quantities to show instead, all of them, such as `"piston.position"`, `"slide.displacement"`,
+        `"hip.angle_rate"`, `"A.force"`, `"energy"` and `"residuals"`. The name of a body, joint, frame or part with
+        internal states selects all quantities of its motion.
 
-    **Returns:** a matplotlib `Figure` with one panel for each kind of quantity [s; m, rad and their rates; N, N m; J].
-    In a panel the components along x, y and z are solid, dashed and dotted. `figure.savefig(path)` writes it; as the
-    last line of a notebook's cell it is shown. Times that a run did not reach are left out.
+    **Returns:** a matplotlib `Figure` with one panel for each unit, or several for more than eight curves. A body has
+    the colour that it has in `plot_mechanism`; components along x, y and z are solid, dashed and dotted. Large forces
+    are in kN, and small lengths in mm. `figure.savefig(path)` writes it; as the last line of a notebook's cell it is
+    shown. Times that a run did not reach are left out, and the title says why the run ended.
 
     **Raises:** `ValueError` for an unknown name, a batch or fewer than two times; `ImportError` without matplotlib.
     """
     trajectory = one_motion(trajectory, "plot_motion")
     if names is None:
-        panels = _moving(_panels(trajectory, _default(trajectory.system)))
+        moving = _moving(_lines(trajectory, _default(trajectory.system)))
+        panels = {unit: _most(lines) for unit, lines in moving.items()}
         checks = _CHECKS if trajectory.system.velocity_rows else _CHECKS[:1]
     else:
         given = (names,) if isinstance(names, str) else tuple(names)
         checks = [name for name in _CHECKS if name in given]
-        panels = _panels(trajectory, _quantities(trajectory.system, [name for name in given if name not in checks]))
-    figure, places = _places(len(panels) + len(checks))
+        panels = _lines(trajectory, _quantities(trajectory.system, [name for name in given if name not in checks]))
+    shown = [panel for lines in panels.values() for panel in _panels(trajectory.system, lines)]
+    figure, places = empty_panels(len(shown) + len(checks))
     t = np.asarray(trajectory.ts)
     _draw_events(places, t, trajectory)
-    for axes, (kind, lines) in zip(places, panels.items(), strict=False):
-        _draw(axes, t, lines)
-        _finish(axes, _LABELS.get(kind, kind.replace("_", " ")))
-    for axes, name in zip(places[len(panels) :], checks, strict=True):
+    for axes, panel in zip(places, shown, strict=False):
+        draw(axes, panel, t)
+    for axes, name in zip(places[len(shown) :], checks, strict=True):
         (_draw_energy if name == "energy" else _draw_residuals)(axes, t, trajectory)
+    share_legends(places)
+    if not bool((trajectory.result == RESULTS.successful) | (trajectory.result == RESULTS.event_occurred)):
+        why = RESULTS[trajectory.result].split(".")[0]  # pyright: ignore[reportInvalidTypeArguments]
+        figure.suptitle(f"The run ended at t = {t[-1]:.4g} s: {why}", fontsize="medium", color="firebrick")
     return figure
 
 
@@ -110,10 +113,10 @@ def _default(system) -> list[str]:
     quantities = system.quantities()
     # In space a body has no angle: angles of joints are shown.
     flat = any(f"{name}.angle" in quantities for name in system.catalogue.motion_names())
-    kinds = ("displacement",) if flat else ("angle", "displacement")
+    words = ("displacement",) if flat else ("angle", "displacement")
     of_bodies = _quantities(system, system.catalogue.motion_names())
-    of_bodies = [name for name in of_bodies if flat or _kind(system, name) != _RATES["angle"]]
-    of_joints = [name for name in system.joint_coordinates() if _kind(system, name) in kinds]
+    of_bodies = [name for name in of_bodies if flat or named(system, name).unit != "rad/s"]
+    of_joints = [name for name in system.joint_coordinates() if named(system, name).word in words]
     return [*of_bodies, *(x for name in of_joints for x in (name, f"{name}_rate"))]
 
 
@@ -135,70 +138,81 @@ def _quantities(system, names: Iterable[str]) -> list[str]:
     return list(out)
 
 
-def _split(system, quantity: str) -> tuple[str, str, bool]:
-    """The part or coordinate of a quantity, the quantity without it, and whether it is a rate."""
-    is_rate = quantity.endswith("_rate") and quantity not in system.coordinate_names()
-    part, _, field = (quantity.removesuffix("_rate") if is_rate else quantity).partition(".")
-    return part, field or "coordinate", is_rate
-
-
-def _kind(system, quantity: str) -> str:
-    """The kind of a quantity; all angles of bodies and joints are of one kind."""
-    _, field, is_rate = _split(system, quantity)
-    kind = "angle" if field in _ANGLES else field
-    if is_rate:
-        return _RATES[kind] if kind in ("angle", "coordinate") else f"{kind}_rate"
-    return kind
-
-
-def _panels(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[_Line]]:
-    """The components of quantities by kind, the kinds in the order of their panels."""
+def _lines(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[_Line]]:
+    """The components of quantities by unit, or by word where there is none, in the order of their panels."""
     out: dict[str, list[_Line]] = {}
     for quantity in quantities:
-        part, field, _ = _split(trajectory.system, quantity)
+        own = named(trajectory.system, quantity)
         # Several angles of a joint have their whole names.
-        name = f"{part}.{field}" if field in _ANGLES else part
+        name = f"{own.part}.{own.field}" if own.field[-2:-1] == "_" else own.part
         values = np.asarray(trajectory.quantity(quantity))
         columns = values.reshape(values.shape[0], -1).T
-        lines = [_Line(name, None if values.ndim == 1 else k, column) for k, column in enumerate(columns)]
-        out.setdefault(_kind(trajectory.system, quantity), []).extend(lines)
-    order = [*_LABELS, *out]
+        lines = [_Line(name, None if values.ndim == 1 else k, column, quantity) for k, column in enumerate(columns)]
+        out.setdefault(own.unit or own.word, []).extend(lines)
+    order = [*_UNITS, *out]
     return dict(sorted(out.items(), key=lambda item: order.index(item[0])))
 
 
 def _moving(panels: dict[str, list[_Line]]) -> dict[str, list[_Line]]:
     """The panels without constant components and their rates."""
-    out = dict(panels)
-    for kind in _WITH_RATES:
-        if kind in panels:
-            size = max(float(np.max(np.abs(line.values))) for line in panels[kind])
-            constant = {line[:2] for line in panels[kind] if np.ptp(line.values) <= _STILL * size}
-            for group in (kind, _RATES[kind]):
-                out[group] = [line for line in panels[group] if line[:2] not in constant]
-    return {kind: lines for kind, lines in out.items() if lines}
+    out, constant = {}, set()
+    for unit, lines in panels.items():
+        base = _RATE_OF.get(unit, unit)
+        size = max(float(np.max(np.abs(line.values))) for line in lines)
+        if base == unit:
+            constant |= {(base, *line[:2]) for line in lines if np.ptp(line.values) <= _STILL * size}
+        out[unit] = [line for line in lines if (base, *line[:2]) not in constant]
+    return {unit: lines for unit, lines in out.items() if lines}
+
+
+def _most(lines: list[_Line]) -> list[_Line]:
+    """The lines of the parts that move most, as many as a panel takes."""
+    ranges: dict[str, float] = {}
+    for line in lines:
+        ranges[line.name] = max(ranges.get(line.name, 0.0), float(np.ptp(line.values)))
+    count = lambda names: sum(line.name in names for line in lines)
+    order = sorted(ranges, key=lambda name: -ranges[name])
+    kept = order[: max(1, sum(count(order[: k + 1]) <= MOST for k in range(len(order))))]
+    return [line for line in lines if line.name in kept]
 
 
 # Drawing
 
 
-def _places(number: int) -> tuple["Figure", list["Axes"]]:
-    """A figure with axes in two columns; an odd panel at the end is as wide as both."""
-    rows = (number + 1) // 2
-    figure = new_figure(9.0, max(3.0, 2.6 * rows) if number > 1 else 3.5)
-    layout: Any = [[str(2 * row), str(min(2 * row + 1, number - 1))] for row in range(rows)]
-    places = list(figure.subplot_mosaic(layout, sharex=True).values())
-    for axes in places[-2 + number % 2 :]:
-        axes.set_xlabel("t [s]")
-    return figure, places
+def _panels(system, lines: Sequence[_Line]) -> list[Panel]:
+    """The panels of lines with one unit; many lines have panels for each component, and for each few bodies."""
+    colors = colors_of([line.name for line in lines], system.body_names)
+    components = sorted({line.component or 0 for line in lines})
+    several, out = len(lines) > MOST, []
+    for block in _blocks(lines, colors) if several else [lines]:
+        names = [line.name + _component(line) for line in block]
+        labels = [
+            name if names.count(name) == 1 else line.quantity + _component(line)
+            for name, line in zip(names, block, strict=True)
+        ]
+        styles = ["-" if several else STYLES[components.index(line.component or 0) % len(STYLES)] for line in block]
+        of_curves = [colors[line.name] for line in block]
+        curves = map(Curve, labels, [line.values for line in block], of_curves, styles)
+        out.append(Panel(*panel_words([named(system, line.quantity) for line in block]), list(curves)))
+    return out
 
 
-def _draw(axes: "Axes", t: np.ndarray, lines: Sequence[_Line]) -> None:
-    colors = {name: f"C{k % 10}" for k, name in enumerate(dict.fromkeys(line.name for line in lines))}
-    drawn = sorted({line.component or 0 for line in lines})
-    for name, k, values in lines:
-        style = ("-", "--", ":")[drawn.index(k or 0) % 3]
-        letter = "" if k is None else f" {'xyz'[k] if k < 3 else k + 1}"
-        axes.plot(t, values, color=colors[name], linestyle=style, label=name + letter)
+def _blocks(lines: Sequence[_Line], colors: Mapping[str, Any]) -> list[list[_Line]]:
+    """Lines of one component and of names with other colours, as many as a panel takes."""
+    out: list[list[_Line]] = []
+    number = lambda line: line.component or 0
+    for _, of_component in itertools.groupby(sorted(lines, key=number), key=number):
+        out.append([])
+        for line in of_component:
+            taken = {colors[other.name] for other in out[-1] if other.name != line.name}
+            if len(out[-1]) == MOST or colors[line.name] in taken:
+                out.append([])
+            out[-1].append(line)
+    return out
+
+
+def _component(line: _Line) -> str:
+    return "" if line.component is None else component(line.component)
 
 
 def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory) -> None:
@@ -221,21 +235,13 @@ def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory
 
 
 def _draw_energy(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None:
-    axes.plot(t, trajectory.kinetic_energy, label="kinetic")
-    axes.plot(t, trajectory.potential_energy, label="potential")
-    axes.plot(t, trajectory.energy, "k", label="sum")
-    _finish(axes, "energy [J]")
+    energies = {"kinetic": trajectory.kinetic_energy, "potential": trajectory.potential_energy}
+    curves = [Curve(name, np.asarray(values), color(k)) for k, (name, values) in enumerate(energies.items())]
+    draw(axes, Panel("energy", "J", [*curves, Curve("sum", np.asarray(trajectory.energy), "black")]), t)
 
 
 def _draw_residuals(axes: "Axes", t: np.ndarray, trajectory: Trajectory) -> None:
     violation = trajectory.constraint_violation
-    axes.semilogy(t, np.maximum(violation.position, _ROUNDING), label="position")
-    axes.semilogy(t, np.maximum(violation.velocity, _ROUNDING), label="velocity [1/s]")
-    _finish(axes, "constraint residual, scaled")
-
-
-def _finish(axes: "Axes", label: str) -> None:
-    axes.set_ylabel(label)
-    axes.grid(alpha=0.3)
-    if len(axes.lines) <= _LEGEND:
-        axes.legend(fontsize="small")
+    axes.semilogy(t, np.maximum(violation.position, _ROUNDING), color=color(0), label="position")
+    axes.semilogy(t, np.maximum(violation.velocity, _ROUNDING), color=color(1), label="velocity [1/s]")
+    finish_panel(axes, "constraint residual, scaled")

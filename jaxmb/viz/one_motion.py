@@ -1,11 +1,17 @@
 """The single motion or state that a picture shows, without times that a run did not reach."""
 
+import functools
+from typing import Any
+
 import jax
 import numpy as np
 
+from .._arguments import check_kind
+from .._compat import changed
 from .._results import RESULTS
 from .._types import State
 from ..simulate.arguments import checked_state
+from ..studies.inverse import RequiredForces
 from ..system import AbstractSystem
 from ..trajectory import Trajectory, states_of, still
 
@@ -24,6 +30,17 @@ def as_motion(shown: Trajectory | State, system: AbstractSystem | None) -> Traje
     return still(system, checked_state(system, shown))
 
 
+@functools.singledispatch
+def poses_of(shown: Any, system: AbstractSystem | None) -> Trajectory:
+    """As `as_motion`, also the poses of needed forces; other forces of that motion are not those that are needed."""
+    return as_motion(shown, system)
+
+
+@poses_of.register
+def _(shown: RequiredForces, system):
+    return changed(still(shown.machine, shown.ys), ts=shown.ts, ys=shown.ys)
+
+
 def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
     """A single motion, without the padding of a run that ended early.
 
@@ -33,6 +50,8 @@ def one_motion(trajectory: Trajectory, name: str, least: int = 2) -> Trajectory:
     """
     if isinstance(trajectory, State):
         raise ValueError(f"{name} shows a motion, got a State, which plot_mechanism and show take.")
+    cure = "what load reads from a file has arrays by name, without a system"
+    check_kind(f"{name}: trajectory", trajectory, Trajectory, "a motion from simulate", cure)
     states_of(trajectory)
     if trajectory.ts.ndim != 1:
         shape = trajectory.ts.shape[:-1]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..studies.linear.root_locus import RootLocus
-from .figure import new_figure
+from .figure import color as color_of, draw_legend, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +42,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     real, imaginary, plane = (places[name] for name in ("real", "imaginary", "plane"))
     for k, (label, mode) in enumerate(zip(labels, modes, strict=True)):
         for order, values in enumerate(mode):
-            color, name = f"C{k % 10}", None if order else label
+            color, name = color_of(k), None if order else label
             real.plot(locus.values, values.real, color=color, linewidth=1.5, label=name)
             imaginary.plot(locus.values, values.imag, color=color, linewidth=1.5)
             plane.plot(values.real, values.imag, ".", color=color, markersize=3)
@@ -54,7 +54,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
         axes.axhline(0.0, color="0.6", linewidth=0.8)
         axes.set_xlabel(locus.name)
         axes.margins(x=0.0)
-    real.legend(fontsize="small")
+    draw_legend(real)
     plane.axvline(0.0, color="0.6", linewidth=0.8)
     plane.axhline(0.0, color="0.6", linewidth=0.8)
     real.set_ylabel("Re λ [1/s]")

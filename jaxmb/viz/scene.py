@@ -10,8 +10,9 @@ from ..parts.base import GROUND
 from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
 from ..trajectory import picture_of, still
-from .mechanism import drawn, faded, finish, in_world
-from .solids import COLORS, solids
+from .figure import color as color_of
+from .mechanism import drawn, finish, in_world
+from .solids import solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,7 +64,7 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
     named = len(bodies) + len(joints) <= _NAMES
     for k, name in enumerate(bodies):
-        color = faded(COLORS[k % len(COLORS)], 1.0)
+        color = color_of(k)
         place = picture.positions[name][0, :dimension]
         axes.plot(*place, "o", color=color, markersize=4, zorder=4)
         if len(bodies) <= _NAMES:

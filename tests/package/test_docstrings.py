@@ -73,6 +73,7 @@ AFTER = {
     "Floquet": "floquet",
     "parts.AbstractFlexibleFrame": "parts.AbstractFlexibleBody",
     "viz.plot_root_locus": "root_locus",
+    "viz.plot_sweep": "sweep",
 }
 # What examples refer to besides.
 BEFORE = {
@@ -197,7 +198,8 @@ LONG = (
     *("kinematics_and_compliance", "required_forces", "KinematicsAndCompliance", "RequiredForces", "Servo"),
     *("formulations.Partitioned", "lagrangian.QuasiVelocities", "formulations.accelerations", "system"),
     *("lagrangian.LagrangianSystem", "spatial.MagicFormulaTyre", "assembly_gap", "planar.Friction", "modules"),
-    *("solvers.integrate", "JointCoupling", "smooth_step", "Trajectory.end", "evaluate"),
+    *("solvers.integrate", "JointCoupling", "smooth_step", "Trajectory.end", "evaluate", "viz.plot_sweep"),
+    *("Trajectory.plot", "Loads"),
 )
 
 

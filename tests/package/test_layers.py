@@ -24,6 +24,7 @@ LAYERS = [
         "_machine",
         "_moved",
         "_pickled",
+        "_pictured",
         "_printed",
         "_setup",
         "_types",

@@ -49,13 +49,13 @@ def drawn(axes):
 
 def test_plot_motion_shows_the_place_and_the_stroke_of_a_piston(piston):
     """Its height and angle stay zero and are left out; the displacement counts from the given pose."""
-    position, velocity, displacement, rate, energy, residual = viz.plot_motion(piston).axes
-    assert list(drawn(position)) == list(drawn(velocity)) == ["piston x"]
-    np.testing.assert_allclose(drawn(position)["piston x"], 0.3 + 0.1 * np.sin(TS))
-    np.testing.assert_allclose(drawn(displacement)["slide"], 0.1 * np.sin(TS), atol=1e-15)
+    place, rate, energy, residual = viz.plot_motion(piston).axes
+    assert list(drawn(place)) == list(drawn(rate)) == ["piston x", "slide"]
+    np.testing.assert_allclose(drawn(place)["piston x"], 0.3 + 0.1 * np.sin(TS))
+    np.testing.assert_allclose(drawn(place)["slide"], 0.1 * np.sin(TS), atol=1e-15)
     np.testing.assert_allclose(drawn(rate)["slide"], 0.1 * np.cos(TS))
-    labels = ["position [m]", "velocity [m/s]", "displacement [m]", "rate of displacement [m/s]", "energy [J]"]
-    assert [axes.get_ylabel() for axes in (position, velocity, displacement, rate, energy)] == labels
+    labels = ["position, displacement [m]", "velocity [m/s]", "energy [J]"]
+    assert [axes.get_ylabel() for axes in (place, rate, energy)] == labels
     assert list(drawn(residual)) == ["position", "velocity [1/s]"]
     np.testing.assert_allclose(drawn(energy)["sum"], (0.1 * np.cos(TS)) ** 2)
 
@@ -66,7 +66,8 @@ def test_plot_motion_shows_quantities_by_name(piston):
     assert [list(drawn(axes)) for axes in of_piston] == [["piston x", "piston y"]] * 2 + [["piston"]] * 2
     assert list(drawn(energy)) == ["kinetic", "potential", "sum"]
     (one,) = (figure := viz.plot_motion(piston, "slide.displacement")).axes
-    np.testing.assert_allclose(drawn(one)["slide"], 0.1 * np.sin(TS), atol=1e-15)
+    assert one.get_ylabel() == "displacement [mm]"
+    np.testing.assert_allclose(drawn(one)["slide"], 100.0 * np.sin(TS), atol=1e-12)
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
@@ -200,15 +201,17 @@ def test_figures_in_space_show_places_of_bodies_and_coordinates_of_joints():
     shown = {axes.get_ylabel(): drawn(axes) for axes in panels}
     of_body = ["nut x", "nut y", "nut z"]
     expected = {
-        "position [m]": of_body,
-        "velocity [m/s]": of_body,
+        "position, displacement [m]": [*of_body, "pin"],
+        "velocity [m/s]": [*of_body, "pin"],
         "angle [rad]": ["pin"],
         "angular velocity [rad/s]": ["pin"],
-        "displacement [m]": ["pin"],
-        "rate of displacement [m/s]": ["pin"],
     }
     assert {label: list(lines) for label, lines in shown.items()} == expected
-    for label, rate in (("angle [rad]", 0.3 * TS), ("angular velocity [rad/s]", 0.3), ("displacement [m]", 0.1 * TS)):
+    for label, rate in (
+        ("angle [rad]", 0.3 * TS),
+        ("angular velocity [rad/s]", 0.3),
+        ("position, displacement [m]", 0.1 * TS),
+    ):
         np.testing.assert_allclose(shown[label]["pin"], rate, rtol=0, atol=1e-14)
     assert energy.get_ylabel() == "energy [J]"
     force, residuals = viz.plot_motion(motion, ["residuals", "pin.force"]).axes

@@ -4,10 +4,13 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import ArrayLike
 
+from ..._arguments import package_for_tables
+from ..._pictured import picture
 from ..._printed import Printed
 from .density import LogDensity, logdensity
 from .fit import Fit, flat
@@ -15,6 +18,9 @@ from .prediction import HeldOut, Prediction, held_out, predict
 from .profile import Profile, profile
 from .report import write_report
 from .verdict import UNDETERMINED, Verdict, judge
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _NO_FIT = "These estimates are not to be trusted"
 
@@ -27,6 +33,7 @@ class Identification(Printed, Fit):
     print(fit)  # A table of estimates and their standard deviations, for `fit` from `identify`.
     fit.parameters["bar.inertia"], fit.deviations["bar.inertia"], fit.converged
     motion = jaxmb.simulate(fit.system, fit.state, t1=1.0)
+    fit.plot().savefig("fit.png")
     ```
 
     **Fields:**
@@ -143,6 +150,32 @@ class Identification(Printed, Fit):
         **Raises:** `ValueError` if the noise level of a sensor is neither known nor free, and after multiple shooting.
         """
         return logdensity(self)
+
+    def plot(self, *sensors: str, level: float | None = 0.95) -> "Figure":
+        """Plot the fit of each sensor beside its data, and the residuals.
+
+        The band contains the true value with the probability `level`, as in `predict`; None leaves it out, and so do
+        sensors with gain, bias or delay. Grey are residuals up to two standard deviations of the noise, rings mark
+        residuals beyond five. Of many sensors, the eight with the largest residuals are shown.
+
+        **Arguments:** `sensors` by name, default all.
+
+        **Returns:** a matplotlib `Figure` with a row for each sensor of each experiment.
+
+        **Raises:** `ValueError` for an unknown sensor and for a residual function; `ImportError` without matplotlib.
+        """
+        return picture("identification.plot", self, sensors, level)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each component: `start`, `estimate`, `deviation` and the `reason` for a
+        missing deviation.
+
+        **Raises:** `ImportError` without pandas.
+        """
+        numbers = zip(*map(flat, (self.start, self.parameters, self.deviations)), strict=True)
+        rows = [(*of_row, self.reasons.get(name, "")) for name, of_row in zip(self.components, numbers, strict=True)]
+        columns = ["start", "estimate", "deviation", "reason"]
+        return package_for_tables("pandas", "pandas").DataFrame(rows, index=list(self.components), columns=columns)
 
     def report(self, path: str | Path, *, profiles: Sequence[str] = ()) -> Path:
         """Write one HTML page: the verdict, the table, each sensor's fit and residuals, correlations and profiles.

@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._arguments import package_for_tables
+from ..._pictured import picture
 from ..._types import State, VectorLike
 from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
@@ -21,11 +23,14 @@ from ...states.consistency import listed
 from ...system import AbstractSystem
 from ...system.description import counted
 from ...system.instant import Instant
-from ...system.quantities import Reaction, Solved
+from ...system.quantities import Reaction, Solved, component_names
 from ...trajectory import Trajectory
 from .balance import Drives, Found, balanced, searched
 from .course import Course, free_names, planned, recorded
 from .drives import drives_of, released, without_drives, without_limits
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Beyond a range by this share of it is a rounding error.
 _ROUNDING = 1e-9
@@ -40,6 +45,7 @@ class RequiredForces(eqx.Module):
     needed = jaxmb.required_forces(system, motion, by=["pin.angle"])
     needed["pin.angle"], needed.power["pin.angle"], needed.reaction("pin").force
     needed.quantity("bar.position"), jaxmb.loads(needed, "bar")
+    needed.plot().savefig("forces.png")
     ```
 
     **Fields:** `ts` [s], shape (times,); `forces` by the names of the actuators, shape (times,), or (times, components)
@@ -75,6 +81,30 @@ class RequiredForces(eqx.Module):
         if name not in quantities:
             raise unknown("quantity", name, quantities)
         return quantities[name].value(self.ts, self.ys, Solved(self.accelerations, self.multipliers))
+
+    def plot(self, *names: str) -> "Figure":
+        """Plot the forces and the powers of actuators against time; default of all.
+
+        **Returns:** a matplotlib `Figure` with a panel for each unit, and one for the powers.
+
+        **Raises:** `ValueError` for an unknown name and a batch; `ImportError` without matplotlib.
+        """
+        return picture("required_forces.plot", self, names)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with the column `t` [s], the force of each actuator by its name, of a vector
+        `"push.force[0]"`, and its power [W], `"pin.angle power"`.
+
+        **Raises:** `ImportError` without pandas; `ValueError` for a batch.
+        """
+        if self.ts.ndim != 1:
+            raise ValueError("A table shows the forces of a single motion, and this is a batch.")
+        columns = {"t": np.asarray(self.ts)}
+        for name, force in self.forces.items():
+            table = np.asarray(force).reshape(self.ts.size, -1)
+            columns |= dict(zip(component_names(name, force.shape[1:]), table.T, strict=True))
+        columns |= {f"{name} power": np.asarray(power) for name, power in self.power.items()}
+        return package_for_tables("pandas", "pandas").DataFrame(columns)
 
     def __repr__(self) -> str:
         if is_traced((self.ts, self.forces)):

@@ -1,7 +1,7 @@
 """The stability of periodic motions by Floquet's multipliers."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ..._arguments import real_array
+from ..._pictured import picture
 from ..._printed import preformatted
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
@@ -26,6 +27,9 @@ from .linearise import state_labels
 from .perturbations import check_state_names, perturbations
 from .quantities import checked_names
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 # The largest distance between the ends of a periodic motion, in units of the system's size, radians and the period; or,
 # if larger, the second number times the tolerance of integration.
 _CLOSED, _OF_TOLERANCE = 1e-6, 1e4
@@ -37,6 +41,7 @@ class Floquet(eqx.Module):
     ```python
     print(periodic)  # Its multipliers, for `periodic` from `floquet`.
     periodic.multipliers, periodic.monodromy, periodic.states
+    periodic.plot().savefig("multipliers.png")
     ```
 
     **Fields:** `monodromy` (k, k): the map of perturbations over a period; `states`: names of the perturbations, first
@@ -63,6 +68,13 @@ class Floquet(eqx.Module):
         """`log(multiplier) / period` [1/s], up to multiples of `2πi / period`."""
         values = self.multipliers
         return jnp.log(values) / self.period.astype(values.dtype)
+
+    def plot(self) -> "Figure":
+        """Draw the multipliers beside the unit circle, within which motions are stable, as a matplotlib `Figure`.
+
+        **Raises:** `ValueError` for a batch; `ImportError` without matplotlib.
+        """
+        return picture("small_motions.floquet", self)
 
     def __repr__(self) -> str:
         return f"Floquet: {len(self.states)} states over one period"

@@ -1,6 +1,7 @@
 """The linear equations of small motions: eigenvalues, modes and frequency responses."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -10,12 +11,16 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from ..._arguments import real_array
+from ..._pictured import picture
 from ..._printed import preformatted
 from ..._types import Scalar, State, VectorLike
 from ...linalg.arrays import is_traced
 from ...manifold.orthogonal_projection import project_normalized
 from ...system import AbstractSystem
 from .eigen import eigen
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # A column of A below this fraction of the largest, in units of the states' sizes, counts as zero.
 _NO_EFFECT = 1e-10
@@ -63,6 +68,7 @@ class Linearisation(eqx.Module):
     about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system), outputs=["bar.angle"])
     print(about_rest)  # Its modes: frequencies, damping and shapes.
     about_rest.A, about_rest.C, about_rest.states
+    about_rest.plot().savefig("eigenvalues.png")
     ```
 
     **Fields:**
@@ -154,6 +160,22 @@ class Linearisation(eqx.Module):
         if times.ndim != 1:
             raise ValueError(f"ts must be a vector of times, got shape {times.shape}.")
         return jax.vmap(lambda t: jax.scipy.linalg.expm(self.A * t) @ start)(times)
+
+    def plot(
+        self, inputs: str | Sequence[str] = (), outputs: str | Sequence[str] = (), *, omega: ArrayLike | None = None
+    ) -> "Figure":
+        """Plot frequency responses, Bode's diagram; of a system without inputs or outputs its eigenvalues.
+
+        **Arguments:** `inputs`, `outputs`: one or several names, default all; `omega`: angular frequencies [rad/s],
+        default from a tenth of the smallest to ten times the largest eigenvalue.
+
+        **Returns:** a matplotlib `Figure` of gains, in SI units, and phases [°]; or of the complex plane, with lines of
+        constant damping ratios.
+
+        **Raises:** `ValueError` for unknown names, more than eight responses and a batch; `ImportError` without
+        matplotlib.
+        """
+        return picture("small_motions.linearisation", self, inputs, outputs, omega)
 
     def to_scipy(self) -> Any:
         """These equations as a `scipy.signal.StateSpace`, without names.

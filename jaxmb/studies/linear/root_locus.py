@@ -1,7 +1,7 @@
 """Eigenvalues along a parameter, with tracked modes."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -9,18 +9,23 @@ import numpy as np
 from jaxtyping import ArrayLike, Complex, Float
 
 from ..._arguments import real_array
+from ..._pictured import picture
 from ..._types import Scalar, State
 from ...parts.names import names_arguments, unknown
 from ...system import AbstractSystem, parameters, with_parameters
 from .linearise import linearise
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 class RootLocus(eqx.Module):
-    """Eigenvalues along a parameter. `viz.plot_root_locus` draws them.
+    """Eigenvalues along a parameter; `plot` draws them.
 
     ```python
     locus = jaxmb.root_locus(system, "bar.inertia", [0.05, 0.08, 0.12], state=jaxmb.equilibrium)
     locus.eigenvalues[-1], locus.states
+    locus.plot().savefig("locus.png")
     ```
 
     **Fields:**
@@ -37,6 +42,10 @@ class RootLocus(eqx.Module):
     eigenvalues: Complex[np.ndarray, "v k"]
     shapes: Complex[np.ndarray, "v n k"]
     states: tuple[str, ...] = eqx.field(static=True)
+
+    def plot(self, labels: Sequence[str] = ()) -> "Figure":
+        """Draw the eigenvalues, as `viz.plot_root_locus`, with `labels` of the modes."""
+        return picture("root_locus.plot_root_locus", self, labels)
 
     def stable(self, least: float = 1e-6) -> np.ndarray:
         """At each value, whether no eigenvalue has a real part above `least` times the largest eigenvalue's size."""

@@ -3,14 +3,15 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import ArrayLike
 
-from ..._arguments import whole_number
+from ..._arguments import package_for_tables, whole_number
+from ..._pictured import picture
 from ..._printed import Printed
 from ..._types import VectorLike
 from ...parts.names import names_arguments
@@ -24,6 +25,9 @@ from .starts import starting_points
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate
 from .unconstrained import first_order
 from .verdict import objection
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Gradients below this, relative to the start's, belong to an optimum.
 _BALANCED = 1e-3
@@ -76,6 +80,7 @@ class Optimum(Printed):
     ```python
     print(best)  # Tables of parameters, outputs and constraints, for `best` from `optimise`.
     best.parameters["bar.inertia"], best.outputs["angle"], best.success
+    best.plot().savefig("optimum.png")
     ```
 
     **Fields:**
@@ -109,15 +114,46 @@ class Optimum(Printed):
     message: str
     derivatives: str
 
+    @property
+    def components(self) -> list[tuple[str, float, float]]:
+        """The components of the parameters: their names, and their values at start and optimum."""
+        return [
+            (name, float(a), float(b))
+            for key, value in self.parameters.items()
+            for name, a, b in zip(component_names(key, value.shape), self.start[key].flat, value.flat, strict=True)
+        ]
+
+    def plot(
+        self, *outputs: str, along: Mapping[str, Any] | None = None, units: Mapping[str, str] | None = None
+    ) -> "Figure":
+        """Plot the objective along the iterations, and the parameters before and after; or outputs before and after.
+
+        **Arguments:** `outputs` by name, to show instead; `along`: the label and the values of their horizontal axis,
+        `{"t [s]": ts}`, default the numbers of the components; `units` of outputs by name. Bounds that hold for all
+        components are dotted lines.
+
+        **Returns:** a matplotlib `Figure`. Parameters are drawn relative to the larger of start and optimum.
+
+        **Raises:** `ValueError` for an unknown output, and values of another number; `ImportError` without matplotlib.
+        """
+        return picture("optimum.plot", self, outputs, along, units)
+
+    def to_pandas(self) -> Any:
+        """A `pandas.DataFrame` with a row for each component of the parameters: `start` and `optimum`.
+
+        **Raises:** `ImportError` without pandas.
+        """
+        names, *numbers = zip(*self.components, strict=True)
+        frame = package_for_tables("pandas", "pandas").DataFrame
+        return frame(dict(zip(("start", "optimum"), numbers, strict=True)), index=list(names))
+
     def __repr__(self) -> str:
         return f"Optimum: objective {self.objective:.6g}, {self.message}"
 
     def __str__(self) -> str:
         numbers = lambda *given: tuple(f"{float(x):.6g}" for x in given)
         rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
-        for name, value in self.parameters.items():
-            each = zip(component_names(name, value.shape), self.start[name].flat, value.flat, strict=True)
-            rows += [(word, *numbers(a, b)) for word, a, b in each]
+        rows += [(word, *numbers(a, b)) for word, a, b in self.components]
         rows += [(), ("output", "before", "after")]
         rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:

@@ -1,11 +1,17 @@
 """Curves of a suspension over wheel travel and steering."""
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._pictured import picture
 from ..._printed import Printed
 from ...linalg.arrays import is_traced
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # The largest number of lines in a table.
 _MOST = 21
@@ -18,6 +24,7 @@ class KinematicsAndCompliance(Printed, eqx.Module):
     wishbone = jaxmb.mechanisms.double_wishbone().system
     curves = jaxmb.kinematics_and_compliance(wishbone, "upright", radius=0.32, travel=np.linspace(-0.08, 0.08, 9))
     curves.toe, curves.bump_steer, curves.motion_ratio["spring"], curves.compliance["lateral_force"]["toe"]
+    curves.plot("toe", "camber").savefig("toe.png")
     ```
 
     All arrays have the shape of `travel`, followed by the shape of `steer` if it steers. Axes: x forward, y to the
@@ -61,6 +68,18 @@ class KinematicsAndCompliance(Printed, eqx.Module):
     compliance: dict[str, dict[str, Float[Array, "*grid"]]]
     q: Float[Array, "*grid nq"]
     freedoms: int = eqx.field(static=True)
+
+    def plot(self, *names: str) -> "Figure":
+        """Plot curves over the travel, which points upward, one for each of at most five steers.
+
+        **Arguments:** `names` of the fields to show, such as `"toe"` and `"caster"`; default toe, camber, the
+        way of the contact patch, the roll centre and the motion ratios.
+
+        **Returns:** a matplotlib `Figure`, in degrees and millimetres.
+
+        **Raises:** `ValueError` for unknown names, and for a single position; `ImportError` without matplotlib.
+        """
+        return picture("suspension.plot", self, names)
 
     def __str__(self) -> str:
         how = f"static equilibria in {self.freedoms} freedoms" if self.freedoms else "kinematics"
