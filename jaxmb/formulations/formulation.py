@@ -6,7 +6,7 @@ All formulations give the same u̇, and the same constraint force Aᵀλ; they d
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -78,7 +78,7 @@ def suitable_jacobian(at: Instant, formulation: AbstractFormulation) -> Abstract
     return at.structured_jacobian.selected(system.acceleration_rank, system.velocity_scale(), row_levels(system))
 
 
-def row_levels(system: AbstractEquation) -> np.ndarray:
+def row_levels(system: AbstractEquation) -> Any:
     """Levels for elimination: 0 for holonomic rows, 1 for nonholonomic rows, 2 for rows of accelerations only.
     `full_pivot` eliminates level 0 first, so that the dependent velocities nest.
     """

@@ -16,7 +16,7 @@ from jaxmb.parts.frames import LinkFrame
 from jaxmb.parts.planar.kinematics import PLANE
 from jaxmb.parts.spatial.kinematics import SPACE
 
-MOST_PROGRAMS = 140
+MOST_PROGRAMS = 200
 
 CENTRE = {2: np.array([0.3, -0.2]), 3: np.array([0.3, -0.2, 0.1])}
 
