@@ -117,14 +117,10 @@ def is_consistent(system: AbstractSystem, t: Any, state: State) -> Any:
 
 @jitted
 def _violated(system, t, y) -> Any:
-    # The rows of the motion, whose kernels are traced once.
-    at, near = Instant.of(system.prepared(), t, y).normalized(), system.closing()
+    near = system.closing()
+    at = Instant.of(near, t, y).normalized()
     tol = max(_TOLERANCE, float(jnp.finfo(y.q.dtype).eps) ** _ROUNDING)
-    sizes = at.row_sizes()
-    positions, velocities = at.violations(sizes)
-    if near is system:
-        # These rows vanish at closed joints alone.
-        positions = jnp.maximum(positions, jnp.abs(near.position_residual(t, at.q)) / sizes[: system.position_rows])
+    positions, velocities = at.violations(at.row_sizes())
     depths = -at.gaps / system.length
     return (positions > tol) | near.half_turned(at.q), velocities > tol, depths > tol
 
