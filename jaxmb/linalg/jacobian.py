@@ -103,6 +103,7 @@ class MassProjector(eqx.Module):
     factor: AbstractPositiveFactor
     responses: Float[Array, "n r"] | None
 
+    @eqx.filter_jit
     def solve(self, force: Float[Array, "n"], rows: Float[Array, "m"]) -> tuple[Float[Array, "n"], Float[Array, "m"]]:
         """x and λ of `M x = f + Aᵀ λ`, `A x = b`, for a metric without infinite entries; λ is zero for implied rows.
 

@@ -37,7 +37,9 @@ class Layout:
         return [self._joined(leaves, dtype) for dtype in self.types if jnp.issubdtype(dtype, jnp.floating)]
 
     def _joined(self, leaves, dtype):
-        return jnp.concatenate([jnp.ravel(x) for x, of in zip(leaves, self.leaves, strict=True) if of.dtype == dtype])
+        chosen = [x for x, of in zip(leaves, self.leaves, strict=True) if of.dtype == dtype]
+        # To ravel a vector is a function call for the tracer.
+        return jnp.concatenate([x if jnp.ndim(x) == 1 else jnp.reshape(x, -1) for x in chosen])
 
     def unpacked(self, vectors: list[Array]) -> PyTree[Array]:
         """The inverse of `packed`."""
