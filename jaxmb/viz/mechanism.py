@@ -102,9 +102,7 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     if not picture.planar:
         axes.set_zlabel("z [m]")
     (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()

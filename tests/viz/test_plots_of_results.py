@@ -447,6 +447,9 @@ def test_sweeps_are_curves_and_maps():
     shown = np.ma.filled(colours.collections[0].get_array(), np.nan)
     np.testing.assert_array_equal(shown.T, [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, np.nan]])
     assert figure.get_suptitle() == "1 of 12 members failed and are left out"
+    for wide, scale in ((10.0 ** np.arange(12.0), "log"), (1.0 + np.arange(12.0), "linear")):
+        colours, bar = viz.plot_sweep(runs.assign(swing=(("mass", "length"), wide.reshape(3, 4))), "swing").axes
+        assert bar.get_yscale() == scale
     (over_time,) = viz.plot_sweep(runs, "angle", at={"length": 0.19}).axes
     assert labels(over_time) == ["mass = 1 kg", "mass = 2 kg", "mass = 3 kg"]
     np.testing.assert_array_equal(over_time.lines[1].get_ydata(), 25.0 + np.arange(5.0))
