@@ -93,3 +93,12 @@ def test_plot_scene_refuses_what_it_cannot_draw():
         viz.plot_scene(scene.bodies[0])
     with pytest.raises(ValueError, match=r"draws bodies, and a LagrangianSystem has none"):
         viz.plot_scene(mb.mechanisms.appell_hamel().system)
+
+
+def test_balls_of_a_chain_of_masses_do_not_touch():
+    count = 12
+    masses = [planar.PointMass(f"m{k}", mass=1.0, position=(float(k), 0.0)) for k in range(count)]
+    rods = [planar.Distance(f"rod{k}", f"m{k}", f"m{k + 1}", length=1.0) for k in range(count - 1)]
+    (axes,) = viz.plot_scene(mb.Scene(masses, joints=rods)).axes
+    balls = [np.ptp(patch.get_path().vertices[:, 0]) for patch in axes.patches]
+    assert len(balls) == count and min(balls) > 0.05 and max(balls) < 0.5
