@@ -39,7 +39,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     labels = tuple(labels) or tuple(f"mode {k}" for k in range(1, len(modes) + 1))
     figure = new_figure(9.0, 5.5)
     places = figure.subplot_mosaic([["real", "plane"], ["imaginary", "plane"]], width_ratios=[3, 2])
-    real, imaginary, plane = (places[name] for name in ("real", "imaginary", "plane"))
+    real, plane, imaginary = places.values()
     for k, (label, mode) in enumerate(zip(labels, modes, strict=True)):
         for order, values in enumerate(mode):
             color, name = color_of(k), None if order else label
