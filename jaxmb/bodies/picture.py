@@ -33,7 +33,7 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         parts.setdefault(
             name, Anchors(bodies, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
         )
-    width = _width(float(system.length), parts)
+    width = _width(float(system.length), parts, dict(zip(names, position[:, 0], strict=True)))
     shapes = [
         (GROUND if k is None else bodies[k], shape)
         for _, bodies, part in single
@@ -88,14 +88,17 @@ def _unstacked(group):
     return [jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(group.names))]
 
 
-def _width(length, parts):
-    """The radius of a bar, from the sizes of the system and of a typical body."""
+def _width(length, parts, places):
+    """The radius of a bar, from the sizes of the system and of a typical body; of points, from their distances."""
     reach: dict[str, float] = {}
     for part in parts.values():
         for body, point in zip(part.bodies, part.points, strict=True):
             if point is not None and body != GROUND:
                 reach[body] = max(reach.get(body, 0.0), float(np.linalg.norm(point)))
-    typical = float(np.median([distance for distance in reach.values() if distance > 0] or [length]))
+    joined = [part.bodies for part in parts.values() if len(part.bodies) == 2 and GROUND not in part.bodies]
+    halves = [0.5 * float(np.linalg.norm(places[a] - places[b])) for a, b in joined]
+    sizes = [distance for distance in reach.values() if distance > 0] or [half for half in halves if half > 0]
+    typical = float(np.median(sizes or [length]))
     return min(0.024 * length, 0.08 * typical)
 
 

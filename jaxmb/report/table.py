@@ -51,16 +51,20 @@ class Table(Printed):
         rows = [dict(zip(self.columns, row, strict=True)) for row in self.rows]
         return {"jaxmb": __version__, "title": self.title, "rows": rows, "notes": list(self.notes)}
 
-    def figure(self, path: str | Path) -> None:
-        """Write a picture (PNG, SVG or PDF by the path's ending), with `to_dict` as JSON in its description.
+    def plot(self) -> "Figure":
+        """A matplotlib `Figure` of the table, which a notebook's cell shows.
 
         **Raises:** `ImportError` that names the extra to install if matplotlib is missing; `ValueError` for a table
         without a figure.
         """
         if self.draw is None:
             raise ValueError(f"There is no figure of this table: {self.title}.")
+        return self.draw(self)
+
+    def figure(self, path: str | Path) -> None:
+        """Write `plot()` as PNG, SVG or PDF by the path's ending, with `to_dict` as JSON in its description."""
         key = "Subject" if Path(path).suffix.lower() == ".pdf" else "Description"
-        self.draw(self).savefig(path, dpi=150, metadata={key: json.dumps(self.to_dict())})
+        self.plot().savefig(path, dpi=150, metadata={key: json.dumps(self.to_dict())})
 
 
 def aligned(rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:

@@ -145,15 +145,14 @@ def _plot(table: Table, title: str, accuracy: float) -> "Figure":
     for axes, (label, quantity) in zip(panels, quantities, strict=True):
         rows = list(zip(table["solver"], table[quantity], table["error"], strict=True))
         for k, solver in enumerate(dict.fromkeys(table["solver"])):
-            points = [(x, error) for name, x, error in rows if name == solver and x is not None]
-            points = [(x, error) for x, error in points if not isinstance(error, str)]
+            own = [(x, error) for name, x, error in rows if name == solver]
+            points = [(x, error) for x, error in own if x is not None and not isinstance(error, str)]
             if points:
                 axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
         if accuracy > 0:
             axes.axhline(accuracy, color="0.5", linestyle=":", label="accuracy of the reference")
         axes.set_xlabel(label)
-        low, high = axes.get_xlim()
-        axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
+        axes.xaxis.set_major_locator(FixedLocator(_ticks(*axes.get_xlim())))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.grid(alpha=0.3)

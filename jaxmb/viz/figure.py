@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 # The largest numbers of curves in a panel, and of panels in a column.
 MOST, _STACKED = 8, 4
-# The largest numbers of names, and of their letters, in a row above a panel.
-_IN_ROW, _LETTERS = 4, 90
+# The largest numbers of names in a row above a panel, and of their letters in a row as wide as the figure.
+_IN_ROW, _LETTERS = 4, 116
 # Of the components of a vector.
 STYLES = ("-", "--", ":", "-.")
 # Units that are shown with prefixes, each from its size on.
@@ -105,7 +105,7 @@ def draw_legend(axes: "Axes") -> None:
     """A legend that hides nothing: a few short names stand above the axes, others beside them."""
     handles, labels = axes.get_legend_handles_labels()
     place: Any = axes.get_subplotspec()
-    if len(labels) <= _IN_ROW and sum(map(len, labels)) * place.get_gridspec().ncols <= _LETTERS:
+    if len(labels) <= _IN_ROW and sum(map(len, labels)) <= _LETTERS * place.get_position(axes.figure).width:
         outside = {"loc": "lower left", "bbox_to_anchor": (0.0, 0.98), "ncols": _IN_ROW, "columnspacing": 1.2}
     else:
         outside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.03)}

@@ -96,8 +96,7 @@ def _arrows(axes, now, centre, colors, dimension):
     axes.autoscale_view()
     axes.margins(0.08)
     axes.set_aspect("equal", **({"adjustable": "datalim"} if dimension == 2 else {}))
-    axes.set_xlabel("x of the body [m]")
-    axes.set_ylabel("y of the body [m]")
+    axes.set(xlabel="x of the body [m]", ylabel="y of the body [m]")
     axes.grid(alpha=0.3)
     if dimension == 3:
         axes.set_zlabel("z of the body [m]")

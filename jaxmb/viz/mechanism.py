@@ -98,18 +98,19 @@ def drawn(picture: Picture, shapes: Sequence[Placed], shown: Sequence[int]) -> t
 
 
 def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -> None:
-    """Draw the terrain, and give the axes labels and equal scales."""
+    """Draw the terrain, and give the axes labels and equal scales; upwards is up in space, too."""
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    if not picture.planar:
-        axes.set_zlabel("z [m]")
-    (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    if picture.planar:
+        (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
         figure.set_figheight(float(np.clip(6.5 * (top - bottom) / (high - low) + 1.0, 2.2, 6.5)))
+    else:
+        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
+        axes.set(zlabel="z [m]", aspect="equal")
+        sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
+        for name, size in zip("xyz", sizes, strict=True):
+            axes.locator_params(axis=name, nbins=max(1, round(8 * size / sizes.max())), min_n_ticks=1)
 
 
 def _draw_areas(axes, picture, shapes, time, fade):

@@ -39,7 +39,7 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
     labels = tuple(labels) or tuple(f"mode {k}" for k in range(1, len(modes) + 1))
     figure = new_figure(9.0, 5.5)
     places = figure.subplot_mosaic([["real", "plane"], ["imaginary", "plane"]], width_ratios=[3, 2])
-    real, imaginary, plane = (places[name] for name in ("real", "imaginary", "plane"))
+    real, plane, imaginary = places.values()
     for k, (label, mode) in enumerate(zip(labels, modes, strict=True)):
         for order, values in enumerate(mode):
             color, name = color_of(k), None if order else label
@@ -48,19 +48,16 @@ def plot_root_locus(locus: RootLocus, labels: Sequence[str] = ()) -> "Figure":
             plane.plot(values.real, values.imag, ".", color=color, markersize=3)
             plane.plot(values.real[:1], values.imag[:1], "o", color=color, markersize=6, fillstyle="none")
     ends = np.concatenate([locus.values[:1], locus.boundaries(_ZERO), locus.values[-1:]])
-    for axes in (real, imaginary):
+    for axes, label in ((real, "Re λ [1/s]"), (imaginary, "Im λ [rad/s]")):
         for low, high in list(itertools.pairwise(ends))[int(locus.stable(_ZERO)[0]) :: 2]:
             axes.axvspan(low, high, color="0.92", linewidth=0, zorder=0)
         axes.axhline(0.0, color="0.6", linewidth=0.8)
-        axes.set_xlabel(locus.name)
+        axes.set(xlabel=locus.name, ylabel=label)
         axes.margins(x=0.0)
     draw_legend(real)
     plane.axvline(0.0, color="0.6", linewidth=0.8)
     plane.axhline(0.0, color="0.6", linewidth=0.8)
-    real.set_ylabel("Re λ [1/s]")
-    imaginary.set_ylabel("Im λ [rad/s]")
-    plane.set_xlabel("Re λ [1/s]")
-    plane.set_ylabel("Im λ [rad/s]")
+    plane.set(xlabel="Re λ [1/s]", ylabel="Im λ [rad/s]")
     return figure
 
 

@@ -62,10 +62,8 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     dimension = 2 if picture.planar else 3
     bodies = [name for name in picture.positions if name != GROUND]
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
-    named = len(bodies) + len(joints) <= _NAMES
     for k, name in enumerate(bodies):
-        color = color_of(k)
-        place = picture.positions[name][0, :dimension]
+        color, place = color_of(k), picture.positions[name][0, :dimension]
         axes.plot(*place, "o", color=color, markersize=4, zorder=4)
         if len(bodies) <= _NAMES:
             _write(axes, place, name, color, (0, 7), weight="bold")
@@ -80,8 +78,7 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
         ]
         is_open = largest.get(name, 0.0) > least
         for point in points:
-            color = _RED if is_open else "black"
-            axes.plot(*point, "o", color=color, markerfacecolor="white", markersize=5, zorder=5)
+            axes.plot(*point, "o", color=_RED if is_open else "black", markerfacecolor="white", markersize=5, zorder=5)
         text = name
         if is_open:
             gap, text = points[-1] - points[0], f"{name}: off by {largest[name]:.3g}"
@@ -90,7 +87,7 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
             if unmet > least and np.isclose(unmet, np.linalg.norm(gap), atol=least):
                 text = f"{name}: {np.linalg.norm(gap):.3g} m apart"
                 axes.plot(*np.stack([points[0], points[-1]]).T, color=_RED, linewidth=2, zorder=6)
-        if named or is_open:
+        if is_open or len(bodies) + len(joints) <= _NAMES:
             _write(axes, np.mean(points, axis=0), text, _RED if is_open else "0.25", (6, -11))
     finish(figure, axes, picture, shapes)
     _entitle(axes, largest, least)

@@ -11,8 +11,8 @@ from .figure import MOST, color, finish_panel, new_figure, with_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The status of a member that was computed without failure.
-_OK = 1
+# The status of a member that was computed without failure, and the ratio of values from which colours are logarithmic.
+_OK, _WIDE = 1, 300.0
 
 
 @names_arguments
@@ -24,7 +24,8 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
     ```
 
     One parameter with a dimension of the output, such as time, gives a curve for each of at most eight values; two
-    parameters give a map. Members that failed are left out, and counted in the title.
+    parameters give a map, with logarithmic colours for positive values of several magnitudes. Members that failed are
+    left out, and counted in the title.
 
     **Arguments:** `runs`: the `xarray.Dataset` from `sweep` or `load_sweep`; `name` of the output; `at`: values of
     dimensions that are held, each at the nearest value of the grid.
@@ -54,8 +55,7 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
         )
     is_map = values.ndim == 2 == sum(dimension in bad.dims for dimension in values.dims)
     figure = new_figure(9.0, 4.2 if is_map else 3.4)
-    axes = figure.add_subplot()
-    (_map if is_map else _curves)(axes, values)
+    (_map if is_map else _curves)(figure.add_subplot(), values)
     failed = f"{int(bad.sum())} of {bad.size} members failed and are left out" if bad.any() else ""
     figure.suptitle("; ".join(filter(None, (", ".join(held), failed))), fontsize="medium")
     return figure
@@ -85,6 +85,9 @@ def _curves(axes, values):
 def _map(axes, values):
     """Colours over two dimensions, the first to the right."""
     right, up = (values[dimension] for dimension in values.dims)
-    mesh = axes.pcolormesh(right, up, np.asarray(values).T, shading="nearest", cmap="viridis", rasterized=True)
+    table = np.asarray(values).T
+    finite = table[np.isfinite(table)]
+    norm = "log" if finite.size and finite.max() > _WIDE * finite.min() > 0 else None
+    mesh = axes.pcolormesh(right, up, table, shading="nearest", cmap="viridis", norm=norm, rasterized=True)
     axes.figure.colorbar(mesh, ax=axes, label=_label(values))
     axes.set(xlabel=_label(right), ylabel=_label(up))

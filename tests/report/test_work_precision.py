@@ -52,6 +52,10 @@ def test_work_precision_has_errors_that_fall_with_the_tolerance(precision, tmp_p
     assert precision._repr_html_().count("<tr>") == 5 and "elliptic functions" in precision._repr_html_()
     plain = json.loads(json.dumps(precision.to_dict()))
     assert plain["rows"][0]["solver"] == precision["solver"][0] == "Adams"
+    errors, _ = precision.plot().axes
+    for line, solver in zip(errors.get_lines(), dict.fromkeys(precision["solver"]), strict=False):
+        shown = [row["error"] for row in plain["rows"] if row["solver"] == solver]
+        np.testing.assert_array_equal(line.get_ydata(), shown)
     precision.figure(tmp_path / "figure.png")
     with Image.open(tmp_path / "figure.png") as image:
         assert image.format == "PNG" and json.loads(image.text["Description"]) == plain
@@ -79,8 +83,9 @@ def test_table_in_words():
     lines = ["name         x  n", "one    5.0e-01  3", "other    small  –"]
     assert str(table).splitlines() == ["a <title>", *lines, "a note"]
     assert "a &lt;title&gt;" in table._repr_html_() and table["n"] == [3, None]
-    with pytest.raises(ValueError, match="no figure of this table: a <title>"):
-        table.figure("figure.png")
+    for drawn in (table.plot, lambda: table.figure("figure.png")):
+        with pytest.raises(ValueError, match="no figure of this table: a <title>"):
+            drawn()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import matplotlib.colors
 import numpy as np
 import pytest
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 import jaxmb as mb
 from jaxmb import planar, spatial, viz
@@ -81,8 +82,11 @@ def test_plot_scene_of_joints_whose_points_need_not_meet():
         axis_a=(0.0, 0.0, 1.0),
         axis_b=(0.0, 0.6, 0.8),
     )
-    (axes,) = viz.plot_scene(mb.Scene([door], joints=[hinge])).axes
+    (axes,) = viz.plot_scene(mb.Scene([door], joints=[hinge], forces=[mb.Gravity((0.0, -9.81, 0.0))])).axes
     assert f"hinge: off by {np.sqrt(0.4):.3g}" in {text.get_text() for text in axes.texts}
+    # Against gravity is up.
+    x, y, _ = proj_transform([0.0, 0.0], [0.0, 0.1], [0.0, 0.0], axes.get_proj())
+    assert y[1] > y[0] and abs(x[1] - x[0]) < 0.2 * (y[1] - y[0])
 
 
 def test_plot_scene_refuses_what_it_cannot_draw():
@@ -93,3 +97,12 @@ def test_plot_scene_refuses_what_it_cannot_draw():
         viz.plot_scene(scene.bodies[0])
     with pytest.raises(ValueError, match=r"draws bodies, and a LagrangianSystem has none"):
         viz.plot_scene(mb.mechanisms.appell_hamel().system)
+
+
+def test_balls_of_a_chain_of_masses_do_not_touch():
+    count = 12
+    masses = [planar.PointMass(f"m{k}", mass=1.0, position=(float(k), 0.0)) for k in range(count)]
+    rods = [planar.Distance(f"rod{k}", f"m{k}", f"m{k + 1}", length=1.0) for k in range(count - 1)]
+    (axes,) = viz.plot_scene(mb.Scene(masses, joints=rods)).axes
+    balls = [np.ptp(patch.get_path().vertices[:, 0]) for patch in axes.patches]
+    assert len(balls) == count and min(balls) > 0.05 and max(balls) < 0.5

@@ -15,7 +15,7 @@ from jaxmb.bodies.units import effort, named
 from jaxmb.studies.identify import Identification
 from jaxmb.studies.optimise.optimise import ConstrainedOutput
 from jaxmb.studies.optimise.trials import Iteration
-from jaxmb.viz.figure import color, colors_of, shown_unit
+from jaxmb.viz.figure import color, colors_of, draw_legend, new_figure, shown_unit
 
 TS = np.linspace(0.0, 1.0, 6)
 
@@ -99,6 +99,19 @@ def test_no_legend_covers_a_curve(double):
     for axes in figure.axes:
         if axes.get_legend():
             assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent().shrunk(0.98, 0.98))
+
+
+def test_legends_stand_above_wide_panels_and_beside_narrow_ones():
+    figure = new_figure(9.0, 3.0)
+    wide, narrow = figure.subplots(1, 2, width_ratios=(1.6, 1))
+    for axes in (wide, narrow):
+        for k in range(2):
+            axes.plot([0.0, 1.0], label=f"driven accelerometer[{k}]")
+        draw_legend(axes)
+    figure.canvas.draw()
+    above, beside = (axes.get_legend().get_window_extent() for axes in (wide, narrow))
+    assert above.y0 > wide.get_window_extent().y1 - 5 and above.x1 < narrow.get_window_extent().x0
+    assert beside.x0 > narrow.get_window_extent().x1 - 5
 
 
 def test_a_motion_that_failed_says_where(double):
@@ -447,6 +460,9 @@ def test_sweeps_are_curves_and_maps():
     shown = np.ma.filled(colours.collections[0].get_array(), np.nan)
     np.testing.assert_array_equal(shown.T, [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, np.nan]])
     assert figure.get_suptitle() == "1 of 12 members failed and are left out"
+    for wide, scale in ((10.0 ** np.arange(12.0), "log"), (1.0 + np.arange(12.0), "linear")):
+        colours, bar = viz.plot_sweep(runs.assign(swing=(("mass", "length"), wide.reshape(3, 4))), "swing").axes
+        assert bar.get_yscale() == scale
     (over_time,) = viz.plot_sweep(runs, "angle", at={"length": 0.19}).axes
     assert labels(over_time) == ["mass = 1 kg", "mass = 2 kg", "mass = 3 kg"]
     np.testing.assert_array_equal(over_time.lines[1].get_ydata(), 25.0 + np.arange(5.0))
