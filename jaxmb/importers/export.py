@@ -49,6 +49,8 @@ def to_mjcf(system: RigidBodySystem, state: State | None = None, *, ignore: str 
     """
     if not system.spatial:
         raise ValueError("to_mjcf needs a spatial scene.")
+    if flexible := [system.body_names[body] for body, *_ in system.layout.flexible]:
+        raise ValueError(f"to_mjcf: {', '.join(flexible)} is flexible, and MJCF joins rigid bodies; replace it.")
     notes = Notes(checked_ignore(ignore))
     tree = spanning_tree(system, (system.guess if state is None else state).q, notes)
     root = ElementTree.Element("mujoco", model="scene")

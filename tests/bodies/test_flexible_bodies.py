@@ -300,6 +300,12 @@ REFUSED = {
 }
 
 
+def test_flexible_body_is_not_exported():
+    """As a rigid body it would move in another way."""
+    with pytest.raises(ValueError, match="box is flexible, and MJCF joins rigid bodies"):
+        mb.importers.to_mjcf(spatial_loop(True).compile())
+
+
 @pytest.mark.parametrize("case", REFUSED)
 def test_flexible_body_is_refused(case):
     bodies, frames, message = REFUSED[case]
