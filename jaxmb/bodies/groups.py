@@ -332,6 +332,10 @@ class BodyGroup(AbstractGroup):
 
     is_flexible: ClassVar[bool] = False
 
+    def prepared(self) -> Self:
+        """The group for the steps of a motion, with values that depend on parameters alone computed once."""
+        return self
+
     @property
     def mass(self) -> Float[Array, "parts"]:
         """Masses [kg]."""
@@ -351,6 +355,12 @@ class FlexibleGroup(BodyGroup):
     """
 
     is_flexible: ClassVar[bool] = True
+
+    def prepared(self):
+        if self.group.kernels:
+            return self
+        part = jax.vmap(lambda part: part.prepared(self._space))(self.group.part)
+        return dataclasses.replace(self, group=dataclasses.replace(self.group, part=part))
 
     def _matrix(self, part, zeta):
         return self.group.kernel("mass_matrix")(part, zeta)
@@ -433,6 +443,18 @@ class FrameGroup(AbstractGroup):
         """Velocities of the frames."""
         single = lambda at, x, v: at(now.t).velocity(self._space, x[0], v[0], *at(now.t).modal(x), *at(now.t).modal(v))
         return self._map(single, now.poses, now.velocities)
+
+
+    @property
+    def quantities(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of the quantities that the frames have because they move in their bodies."""
+        part, d = self.group.part, self._space.dimension
+        shapes = part.quantities if part.is_flexible else {}
+        return {name: tuple(d if size == "d" else size for size in shape) for name, shape in shapes.items()}
+
+    def measured(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
+        """These quantities."""
+        return self._map(lambda at, x: at(t).measured(self._space, *at(t).modal(x)), poses)
 
 
 class AbstractConstraintGroup(AbstractGroup):
