@@ -92,5 +92,5 @@ def _shapes(counts, coefficients, stations):
     values = xp.stack(polynomials[: len(coefficients)], axis=-1) @ coefficients.astype(x.dtype)
     bend, stretch, twist = counts
     ends = np.cumsum([bend, bend, bend, stretch, stretch, twist])
-    *parts, shortening = xp.split(values, ends, axis=-1)
-    return BarShapes(*parts, shortening.reshape(*shortening.shape[:-1], bend, bend))
+    parts = xp.split(values, ends, axis=-1)
+    return BarShapes(*parts[:-1], shortening=parts[-1].reshape(*parts[-1].shape[:-1], bend, bend))

@@ -8,10 +8,10 @@ J. Guidance 10(2), 1987 (a bar's stretch as a coordinate, and its shortening by 
 import abc
 from collections.abc import Mapping
 from os import PathLike
-from typing import Any, ClassVar, NamedTuple, Self
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -41,23 +41,6 @@ _MOST_MODES = 8
 _RECTANGLE = ("width", "thickness")
 
 
-class MassIntegrals(NamedTuple):
-    """Integrals over the mass of undeformed points x and of displacements ψ by unit coordinates, and of the shortening
-    of a bar by bending, `½ Σ h_kl ζ_k ζ_l` along its axis.
-
-    **Fields:** `mass`; `first` ∫x (d,), `second` ∫x xᵀ (d, d); `modal` ∫ψ_k (n, d), `mixed` ∫x ψ_kᵀ (n, d, d),
-    `products` ∫ψ_k ψ_lᵀ (n, n, d, d); `shortening` ∫h (n, n) and ∫x h (n, n), or None.
-    """
-
-    mass: Array
-    first: Array
-    second: Array
-    modal: Array
-    mixed: Array
-    products: Array
-    shortening: tuple[Array, Array] | None = None
-
-
 class ElasticNumbers(eqx.Module):
     """The kernels of an elastic body, with values that depend on its numbers alone.
 
@@ -71,9 +54,15 @@ class ElasticNumbers(eqx.Module):
     stiffness: Float[Array, "n n"]
     damping: Float[Array, "n n"]
 
+    def prepared(self, space: AbstractSpace) -> Self:
+        del space
+        return self
+
     def mass_matrix(self, space: AbstractSpace, zeta: Float[Array, "n"]) -> Float[Array, "m m"]:
         rows, columns = np.triu_indices(len(zeta))
-        return jnp.tensordot(jnp.concatenate([jnp.ones_like(zeta[:1]), zeta, zeta[rows] * zeta[columns]]), self.terms, 1)
+        return jnp.tensordot(
+            jnp.concatenate([jnp.ones_like(zeta[:1]), zeta, zeta[rows] * zeta[columns]]), self.terms, 1
+        )
 
     def energy(self, space: AbstractSpace, zeta: Float[Array, "n"]) -> Float[Array, ""]:
         return 0.5 * zeta @ self.stiffness @ zeta
@@ -88,56 +77,29 @@ def _inertia(d: int, second: Array) -> Float[Array, "... r r"]:
     return namespace(second).einsum("rab,qac,...bc->...rq", turns, turns, second)
 
 
-def _mass_terms(d: int, given: MassIntegrals) -> Float[Array, "p m m"]:
-    """The mass matrix as a polynomial of the modal coordinates, to their second order."""
-    turns, n = _TURNS[d].astype(given.mass.dtype), len(given.modal)
+def _symmetric(x: Array) -> Array:
+    return x + jnp.swapaxes(x, -1, -2)
+
+
+def _pairs(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The indices of products of coordinates, and the number of each in a sum over both, (p, 1, 1)."""
     k, l = np.triu_indices(n)
-    # Twice as many products off the diagonal.
-    twice = np.where(k == l, 1.0, 2.0)[:, None, None]
-    nothing = lambda *shape: jnp.zeros(shape, given.mass.dtype)
-    swept = lambda first: jnp.einsum("rab,...b->...ar", turns, first)
-    turning = lambda mixed: jnp.einsum("rab,...kba->...rk", turns, mixed)
-    symmetric = lambda x: x + jnp.swapaxes(x, -1, -2)
-    # By translation and rotation, by translation and ζ, by rotation twice, and by rotation and ζ; for each term.
-    of_swept = [swept(given.first)[None], swept(given.modal), nothing(len(k), d, len(turns))]
-    of_modal = [given.modal.T[None], nothing(n, d, n), nothing(len(k), d, n)]
-    second = [given.second[None], symmetric(given.mixed), twice * symmetric(given.products[k, l]) / 2]
-    of_turning = [turning(given.mixed)[None], turning(given.products), nothing(len(k), len(turns), n)]
-    if given.shortening is not None:
-        axis = np.eye(d)[:1]
-        whole, about = given.shortening
-        of_swept[2] = swept(twice[:, 0] * whole[k, l][:, None] * axis) / 2
-        of_modal[1] = whole[:, None] * axis[:, :, None]
-        second[2] = second[2] + twice * about[k, l][:, None, None] * (axis.T @ axis)[None]
-    join = lambda parts: jnp.concatenate(parts)
-    once = lambda matrix: jnp.concatenate([matrix[None], nothing(n + len(k), *matrix.shape)])
-    upper = jnp.concatenate([once(given.mass * jnp.eye(d)), join(of_swept), join(of_modal)], axis=2)
-    middle = jnp.concatenate([jnp.swapaxes(join(of_swept), 1, 2), _inertia(d, join(second)), join(of_turning)], axis=2)
-    modal = once(jnp.einsum("klaa->kl", given.products))
-    lower = jnp.concatenate([jnp.swapaxes(join(of_modal), 1, 2), jnp.swapaxes(join(of_turning), 1, 2), modal], axis=2)
-    return jnp.concatenate([upper, middle, lower], axis=1)
+    return k, l, np.where(k == l, 1.0, 2.0)[:, None, None]
 
 
 class AbstractElastic(AbstractFlexibleBody):
-    """An elastic body, from its integrals, stiffness and damping."""
+    """An elastic body, from the mass matrix to the second order in ζ, and from stiffness and damping."""
 
     @abc.abstractmethod
-    def integrals(self) -> MassIntegrals:
-        """The integrals over its mass."""
+    def mass_terms(self) -> Float[Array, "p m m"]:
+        """The terms of the mass matrix as in `ElasticNumbers`."""
 
     @abc.abstractmethod
     def matrices(self) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
         """Stiffness and damping by the modal coordinates."""
 
     def prepared(self, space):
-        stiffness, damping = self.matrices()
-        given = MassIntegrals(*jax.tree.map(jnp.asarray, self.integrals()))
-        return ElasticNumbers(self.mass, self.inertia, _mass_terms(space.dimension, given), stiffness, damping)
-
-    @property
-    def inertia(self):
-        moments = _inertia(self.dimension, self.integrals().second)
-        return moments if self.dimension == 3 else moments[0, 0]
+        return ElasticNumbers(self.mass, self.inertia, self.mass_terms(), *self.matrices())
 
     def mass_matrix(self, space, zeta):
         return self.prepared(space).mass_matrix(space, zeta)
@@ -177,9 +139,32 @@ class AbstractElasticBody(AbstractElastic):
         names = self.names or [f"mode_{k}" for k in range(1, self.stiffness.shape[-1] + 1)]
         return tuple(ScalarCoordinate(name, is_length=True, moves=True) for name in names)
 
-    def integrals(self):
-        modal = self.modal_moments, self.mixed_moments, self.modal_products
-        return MassIntegrals(self.mass, self.first_moment, self.second_moment, *modal)
+    @property
+    def inertia(self):
+        moments = _inertia(self.dimension, self.second_moment)
+        return moments if self.dimension == 3 else moments[0, 0]
+
+    def mass_terms(self):
+        d, n = self.modal_moments.shape[::-1]
+        turns, (k, l, count) = _TURNS[d].astype(self.mass.dtype), _pairs(n)
+        nothing = lambda *shape: jnp.zeros(shape, self.mass.dtype)
+        once = lambda matrix: jnp.concatenate([matrix[None], nothing(n + len(k), *matrix.shape)])
+        both = jnp.concatenate([self.first_moment[None], self.modal_moments, nothing(len(k), d)])
+        swept = jnp.einsum("rab,pb->par", turns, both)
+        second = [self.second_moment[None], _symmetric(self.mixed_moments)]
+        turned = _inertia(d, jnp.concatenate([*second, count / 2 * _symmetric(self.modal_products[k, l])]))
+        # The displacement by mode l of points displaced by mode k.
+        mixed = jnp.concatenate([self.mixed_moments[None], self.modal_products])
+        turning = jnp.einsum("rab,plba->prl", turns, mixed)
+        turning = jnp.concatenate([turning, nothing(len(k), len(turns), n)])
+        modal = once(jnp.einsum("klaa->kl", self.modal_products))
+        moments, transposed = once(self.modal_moments), lambda x: jnp.swapaxes(x, 1, 2)
+        rows = [
+            [once(self.mass * jnp.eye(d, dtype=self.mass.dtype)), swept, transposed(moments)],
+            [transposed(swept), turned, turning],
+            [moments, transposed(turning), modal],
+        ]
+        return jnp.concatenate([jnp.concatenate(row, axis=2) for row in rows], axis=1)
 
     def matrices(self):
         return self.stiffness, jnp.zeros_like(self.stiffness) if self.damping is None else self.damping
@@ -309,7 +294,7 @@ class AbstractElasticBar(AbstractElastic):
         if not self.modes:
             raise ValueError(f"{self.label} has no modes; a bar without deformation is a Body.")
         rectangle, other = ([values[name] is not None for name in names] for names in (_RECTANGLE, self.of_section))
-        if not (all(rectangle) and not any(other) or all(other) and not any(rectangle)):
+        if all(rectangle) == all(other) or (any(rectangle) and any(other)):
             raise ValueError(f"{self.label}: give width and thickness, or {', '.join(self.of_section)} in their place.")
         super().validate()
 
@@ -341,38 +326,46 @@ class AbstractElasticBar(AbstractElastic):
         along = shapes.stretch[:, None] * np.eye(d)[:, :1]
         return np.concatenate([across, along, np.zeros((s, d, self.torsion))], axis=2)
 
-    def integrals(self):
-        # Displacements of the centre line, and those by a unit distance from it across the bar.
-        tables, d = self._tables, self.dimension
-        turns = jnp.asarray(self._section_turns(tables.shapes))
-        swept = jnp.einsum("rab,srn->bsan", _TURNS[d], turns)[1:]
-        moves = jnp.concatenate([jnp.asarray(self._line_moves(tables.shapes))[None], swept])
-        line = jnp.outer(self.length * tables.stations, np.eye(d)[0])
-        points = jnp.concatenate([line[None], np.broadcast_to(np.eye(d)[1:, None], (d - 1, *line.shape))])
-        moments = jnp.concatenate([jnp.reshape(self.sectional_area, (1,)), self.second_moments()])
-        weights = jnp.outer(self.density * self.length * moments, tables.weights)
-        of_line = weights[0]
-        return MassIntegrals(
-            self.mass,
-            of_line @ points[0],
-            jnp.einsum("cs,csa,csb->ab", weights, points, points),
-            jnp.einsum("s,san->na", of_line, moves[0]),
-            jnp.einsum("cs,csa,csbn->nab", weights, points, moves),
-            jnp.einsum("cs,csan,csbm->nmab", weights, moves, moves),
-            self._shortening(of_line),
-        )
+    @property
+    def inertia(self):
+        along = jnp.reshape(self.mass * self.length**2 / 3, (1,))
+        moments = self.density * self.length * self.second_moments()
+        matrix = _inertia(self.dimension, jnp.diag(jnp.concatenate([along, moments])))
+        return matrix if self.dimension == 3 else matrix[0, 0]
 
-    def _shortening(self, weights):
-        """Integrals of the shortening, and of its product with the place along the bar."""
-        tables, others = self._tables, self.stretch + self.torsion
-        drawn = jnp.einsum("s,sij->ij", weights / self.length, tables.shapes.shortening)
-        about = jnp.einsum("s,sij->ij", weights * tables.stations, tables.shapes.shortening)
-        every = lambda x: jnp.pad(jnp.kron(np.eye(len(self.bends)), -x), ((0, others), (0, others)))
-        return every(drawn), every(about)
+    def mass_terms(self):
+        # Velocities by those of the body, of points of the centre line, and by a unit distance from it across the bar:
+        # (1 or d, stations, d, m), to the second order in ζ.
+        tables, d, n = self._tables, self.dimension, len(self.modes)
+        turns, stations, (k, l, count) = _TURNS[d], tables.stations, _pairs(n)
+        swept = lambda x: jnp.einsum("rab,...b->...ar", turns, x)
+        line = jnp.outer(self.length * stations, np.eye(d)[0])
+        places = jnp.concatenate([line[None], np.broadcast_to(np.eye(d)[1:, None], (d - 1, *line.shape))])
+        across = jnp.einsum("rab,srn->bsan", turns, self._section_turns(tables.shapes))[1:]
+        moves = jnp.concatenate([jnp.asarray(self._line_moves(tables.shapes))[None], across])
+        carried = np.zeros((d, len(stations), d, d))
+        carried[0] = np.eye(d)
+        at_rest = jnp.concatenate([carried, swept(places), moves], axis=3)
+        # The displacement along the bar, half of `drawn` by the products of two coordinates.
+        drawn = np.kron(np.eye(d - 1), -tables.shapes.shortening) / self.length
+        drawn = jnp.pad(drawn, ((0, 0), *((0, self.stretch + self.torsion),) * 2))
+        axis = np.eye(d)[0]
+        shortened = jnp.einsum("skn,a->ksan", drawn, axis)[:, None]
+        shortened = jnp.pad(shortened, ((0, 0), (0, d - 1), (0, 0), (0, 0), (0, 0)))
+        still = jnp.zeros((n, d, len(stations), d, d), moves.dtype)
+        first = jnp.concatenate([still, swept(jnp.moveaxis(moves, 3, 0)), shortened], axis=4)
+        turned = swept(jnp.einsum("sp,a->psa", drawn[:, k, l], axis))
+        second = jnp.pad(turned, ((0, 0), (0, 0), (0, 0), (d, n)))
+        sides = jnp.concatenate([jnp.reshape(self.sectional_area, (1,)), self.second_moments()])
+        weights = self.density * self.length * jnp.outer(sides, jnp.asarray(tables.weights))
+        product = lambda x, y: jnp.einsum("cs,...csai,...csaj->...ij", weights, x, y)
+        of_pairs = product(first[k], first[l]) + jnp.einsum("s,psai,saj->pij", weights[0], second, at_rest[0])
+        by_one = _symmetric(product(first, jnp.broadcast_to(at_rest, first.shape)))
+        return jnp.concatenate([product(at_rest, at_rest)[None], by_one, count / 2 * _symmetric(of_pairs)])
 
     def matrices(self):
         bend, stretch, twist = self._tables.stiffness
-        bends = jnp.outer(self.young * self.second_moments(), bend) / self.length**3
+        bends = jnp.outer(self.young * self.second_moments(), jnp.asarray(bend)) / self.length**3
         along = self.young * self.sectional_area * stretch / self.length
         twists = self.torsional_rigidity() * twist / self.length
         stiffness = jnp.diag(jnp.concatenate([bends.reshape(-1), along, twists]))
@@ -412,7 +405,7 @@ class BarFrame(AbstractFlexibleFrame):
     station: fields.Number = fields.parameter(unit="1", sign="non-negative", default=1.0)
     offset: fields.Number = fields.parameter(shape=None, unit="m", optional=True)
     bar: Any = fields.part(AbstractElasticBar)
-    quantities = AbstractFlexibleFrame.quantities | {"strain": (), "stress": ()}
+    quantities = MappingProxyType({**AbstractFlexibleFrame.quantities, "strain": (), "stress": ()})
 
     def validate(self):
         if not is_traced(self.station) and self.station > 1:

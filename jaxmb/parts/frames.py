@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -166,7 +167,7 @@ class AbstractFlexibleFrame(AbstractFrame):
     """
 
     # Shapes of the quantities that `measured` gives, with `"d"` for the dimension of the space.
-    quantities: ClassVar[Mapping[str, tuple[Any, ...]]] = {"deflection": ("d",)}
+    quantities: ClassVar[Mapping[str, tuple[Any, ...]]] = MappingProxyType({"deflection": ("d",)})
 
     def placed(self, body: AbstractFlexibleBody) -> Self:
         """Hook: the frame in this body. A frame whose pose depends on the body's numbers is a copy that holds the body,
@@ -271,7 +272,7 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
     def based(name, path):
         if name in out or name not in given:
             return
-        frame = given[name]
+        frame: Any = given[name]
         if name in path:
             raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
         if frame.body not in (*given, *bodies_by_name, GROUND):

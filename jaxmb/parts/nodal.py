@@ -12,7 +12,7 @@ from jaxtyping import Float
 # Errors of symmetry and of rigid motions in given matrices, relative to their largest entries.
 _SAME = 1e-6
 # The stiffness of a combination of modes, relative to the largest, below which it is a rigid motion.
-_RIGID = 1e-10
+_RIGID = 1e-12
 
 
 class Model(NamedTuple):
@@ -28,7 +28,11 @@ class Model(NamedTuple):
 
 
 def reduced(
-    label: str, dimension: int, source: Mapping[str, Any] | str | PathLike[str], interfaces: Mapping[str, Any], fixed: int
+    label: str,
+    dimension: int,
+    source: Mapping[str, Any] | str | PathLike[str],
+    interfaces: Mapping[str, Any],
+    fixed: int,
 ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
     """The arrays of an elastic body, and those of a frame at each interface, by name."""
     model = _model(label, dimension, source)
@@ -37,17 +41,27 @@ def reduced(
     modes = _craig_bampton(model, means, fixed) if model.modes is None else model.modes
     stiffness = modes.T @ (model.stiffness @ modes)
     stiffness = 0.5 * (stiffness + stiffness.T)
-    sizes = np.sqrt(np.maximum(np.diag(stiffness), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(stiffness / np.outer(sizes, sizes))
-    soft = [f"mode_{k + 1}" for k in np.flatnonzero(np.abs(vectors[:, 0]) > 1e-3)]
-    if values[0] < _RIGID or np.min(sizes) < np.sqrt(_RIGID) * np.max(sizes):
-        raise ValueError(f"{label}: the modes {', '.join(soft)} contain a rigid motion, or depend on each other.")
+    _check_stiffness(model, modes, stiffness)
     d = dimension
     frames = {
         name: {"position": centre, "shapes": mean[:d] @ modes, "turning": mean[d:] @ modes}
         for name, (centre, mean) in ends.items()
     }
     return _integrals(model, modes) | {"stiffness": stiffness}, frames
+
+
+def _check_stiffness(model, modes, stiffness):
+    """Refuse modes with combinations that have no stiffness."""
+    own = np.diag(stiffness)
+    soft = own < _RIGID * abs(model.stiffness).max() * np.sum(modes**2, axis=0)
+    if not np.any(soft):
+        values, vectors = np.linalg.eigh(stiffness / np.sqrt(np.outer(own, own)))
+        soft = np.abs(vectors[:, 0]) > 1e-3 if values[0] < _RIGID else soft
+    if np.any(soft):
+        named = ", ".join(f"mode_{k + 1}" for k in np.flatnonzero(soft))
+        raise ValueError(
+            f"{model.label}: {named} contain a rigid motion, or depend on each other; leave out such modes."
+        )
 
 
 def _model(label, d, source):
@@ -70,7 +84,9 @@ def _model(label, d, source):
         raise ValueError(f"{label}: mass and stiffness must be positive, and have entries ≤ 0 on their diagonals.")
     rigid = _rigid(nodes, nodes.mean(axis=0))
     if abs(stiffness @ rigid).max() > _SAME * abs(stiffness).max() * abs(rigid).max():
-        raise ValueError(f"{label}: stiffness resists rigid motions; give the matrix of the free body, and clamp frames.")
+        raise ValueError(
+            f"{label}: stiffness resists rigid motions; give the matrix of the free body, and clamp frames."
+        )
     modes = arrays.get("modes")
     if modes is not None:
         modes = np.asarray(modes, float).reshape(n * d, -1)
@@ -96,16 +112,18 @@ def _rigid(nodes, centre):
 
 def _interface(model, name, index):
     """The centre of an interface, and its mean displacement and rotation by the displacements of all nodes."""
-    index, (n, d) = np.atleast_1d(np.asarray(index)), model.nodes.shape
+    index, (n, d) = np.unique(np.asarray(index)), model.nodes.shape
     if index.dtype.kind not in "iu" or not index.size or np.min(index) < 0 or np.max(index) >= n:
         raise ValueError(f"{model.label}: the interface {name!r} must have indices of nodes, from 0 to {n - 1}.")
     own = model.nodes[index]
     centre = own.mean(axis=0)
     motions = _rigid(own, centre)
     if np.linalg.matrix_rank(motions, tol=1e-9 * np.ptp(model.nodes)) < motions.shape[1]:
-        raise ValueError(f"{model.label}: the nodes of the interface {name!r} lie in a line or a point, and cannot turn.")
+        raise ValueError(
+            f"{model.label}: the nodes of the interface {name!r} lie in a line or a point, and cannot turn."
+        )
     out = np.zeros((motions.shape[1], n, d))
-    np.add.at(out, (slice(None), index), np.linalg.pinv(motions).reshape(-1, len(index), d))
+    out[:, index] = np.linalg.pinv(motions).reshape(-1, len(index), d)
     return centre, out.reshape(-1, n * d)
 
 
@@ -118,7 +136,9 @@ def _craig_bampton(model, means, fixed):
     held, first = np.concatenate(means), len(means[0])
     free = len(stiffness) - len(held)
     if not 0 <= fixed <= free:
-        raise ValueError(f"{label}: fixed must be from 0 to {free}, the displacements that interfaces leave, got {fixed}.")
+        raise ValueError(
+            f"{label}: fixed must be from 0 to {free}, the displacements that interfaces leave, got {fixed}."
+        )
     _check_count(label, len(held) - first + fixed, len(stiffness))
     size = np.max(np.abs(stiffness))
     system = np.block([[stiffness / size, held.T], [held, np.zeros((len(held),) * 2)]])

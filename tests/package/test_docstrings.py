@@ -70,6 +70,7 @@ AFTER = {
     "robust": "optimise",
     "Floquet": "floquet",
     "parts.AbstractFlexibleFrame": "parts.AbstractFlexibleBody",
+    "planar.ModalFrame": "planar.ElasticBody",
     "viz.plot_root_locus": "root_locus",
 }
 # What examples refer to besides.
