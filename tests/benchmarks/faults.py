@@ -492,14 +492,14 @@ FAULTS = [
         "return (height - 2 * self.radius * norm(self.normal))[None]",
     ),
     # Bodies and systems
-    Fault("bodies/body_set.py", "self.mass[:, None] * gravity[None, :]", "self.mass[:, None] * -gravity[None, :]"),
+    Fault("bodies/body_set.py", "(mass[:, None] * gravity[None, :]", "(mass[:, None] * -gravity[None, :]"),
     Fault(
         "bodies/body_set.py",
         "moment = -jax.vmap(lambda J, w: cross(w, J @ w))",
         "moment = jax.vmap(lambda J, w: cross(w, J @ w))",
     ),
     Fault("bodies/body_set.py", "moment = lambda J, w: -cross(w, J @ w)", "moment = lambda J, w: cross(w, J @ w)"),
-    Fault("bodies/body_set.py", "rotate(p, J @ w))(poses[:, 3:]", "J @ rotate(p, w))(poses[:, 3:]"),
+    Fault("bodies/body_set.py", "jax.vmap(rotate)(poses[:, 3:], momenta[:, 3:])", "momenta[:, 3:]"),
     Fault(
         "bodies/elementary.py",
         "half = np.where(self.places.with_x, 1.0, 0.5)",
@@ -588,9 +588,9 @@ FAULTS = [
         "moment = moment - cross(point, force)",
     ),
     Fault(
-        "bodies/rigid_bodies.py",
-        "energy if gravity is None else energy + self",
-        "energy if gravity is None else energy - self",
+        "bodies/body_set.py",
+        "[-jnp.sum(self._of_rigid(self.mass) * heights)",
+        "[jnp.sum(self._of_rigid(self.mass) * heights)",
     ),
     Fault(
         "bodies/rigid_bodies.py",
@@ -765,7 +765,7 @@ FAULTS = [
     Fault("parts/elastic.py", '"rab,plba->prl"', '"rab,plab->prl"'),
     Fault("parts/elastic.py", "-tables.shapes.shortening) / self.length", "tables.shapes.shortening) / self.length"),
     Fault("parts/elastic.py", "/ self.length - offset @ curvature", "/ self.length + offset @ curvature"),
-    Fault("parts/elastic.py", "stretch / self.length", "stretch * self.length"),
+    Fault("parts/elastic.py", "area * stretch / self.length", "area * stretch * self.length"),
     Fault("parts/spatial/elastic.py", "[0.0, -1.0], [1.0, 0.0]", "[0.0, 1.0], [1.0, 0.0]"),
     Fault("parts/spatial/elastic.py", "[self.thickness**2, self.width**2]", "[self.width**2, self.thickness**2]"),
     Fault("parts/planar/kinematics.py", "2 * xp.arctan(turn / 2)", "xp.arctan(turn / 2)"),
@@ -947,7 +947,7 @@ FAULTS = [
         "return points + centre[None], forces, moments - jnp.cross(points, forces)",
         "return points + centre[None], forces, moments",
     ),
-    Fault("studies/loads.py", "J @ turning + cross(omega, J @ omega)", "J @ turning"),
+    Fault("studies/loads.py", "on_body(without - system.inertia(now.t", "on_body(without + system.inertia(now.t"),
     Fault(
         "studies/loads.py",
         "arms = self.points - self.mass_centre[None, None]",
