@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -186,6 +186,10 @@ class BodySet(eqx.Module):
         return dataclasses.replace(guess, q=q, u=u)
 
     # Inertia and forces
+
+    def prepared(self) -> Self:
+        """The set for the steps of a motion, with values that depend on parameters alone computed once."""
+        return dataclasses.replace(self, groups=tuple(g.prepared() for g in self.groups)) if self.flexible else self
 
     @property
     def flexible(self) -> tuple[Any, ...]:

@@ -332,6 +332,10 @@ class BodyGroup(AbstractGroup):
 
     is_flexible: ClassVar[bool] = False
 
+    def prepared(self) -> Self:
+        """The group for the steps of a motion, with values that depend on parameters alone computed once."""
+        return self
+
     @property
     def mass(self) -> Float[Array, "parts"]:
         """Masses [kg]."""
@@ -352,6 +356,14 @@ class FlexibleGroup(BodyGroup):
 
     is_flexible: ClassVar[bool] = True
 
+    def prepared(self):
+        part = jax.vmap(self._numbers)(self.group.part)
+        return dataclasses.replace(self, group=dataclasses.replace(self.group, part=part))
+
+    def _numbers(self, part):
+        """A body with values of its numbers alone; kernels of a user's class take the body itself."""
+        return part if self.group.kernels else part.prepared(self._space)
+
     def _matrix(self, part, zeta):
         return self.group.kernel("mass_matrix")(part, zeta)
 
@@ -360,7 +372,7 @@ class FlexibleGroup(BodyGroup):
         d = self._space.dimension
 
         def single(at, x):
-            matrix = self._matrix(at(0.0), x[1:, 0])
+            matrix = self._matrix(self._numbers(at(0.0)), x[1:, 0])
             turned = jax.vmap(functools.partial(self._space.body_direction, x[0]), out_axes=1)
             to_body = jnp.eye(len(matrix), dtype=x.dtype).at[:d, :d].set(turned(jnp.eye(d, dtype=x.dtype)))
             return to_body.T @ matrix @ to_body
@@ -372,8 +384,8 @@ class FlexibleGroup(BodyGroup):
         return self._map(functools.partial(self._wrenches, gravity), now.poses, now.velocities)
 
     def _wrenches(self, gravity, at, x, v):
-        space, part, d, size = self._space, at(0.0), self._space.dimension, self._space.velocity_size
-        kernel, zeta, rates = self.group.kernel, x[1:, 0], v[1:, 0]
+        space, d, size = self._space, self._space.dimension, self._space.velocity_size
+        part, kernel, zeta, rates = self._numbers(at(0.0)), self.group.kernel, x[1:, 0], v[1:, 0]
         in_body = lambda pose, velocity: jnp.concatenate([space.body_direction(pose, velocity), v[0, d:], rates])
         in_world = lambda pose, p: jnp.concatenate([space.direction(pose, p[:d]), p[d:]])
 
@@ -402,7 +414,7 @@ class FlexibleGroup(BodyGroup):
         space, d = self._space, self._space.dimension
 
         def single(at, x):
-            part, zeta = at(0.0), x[1:, 0]
+            part, zeta = self._numbers(at(0.0)), x[1:, 0]
             energy = self.group.kernel("energy")(part, zeta)
             if gravity is None:
                 return energy
@@ -433,6 +445,17 @@ class FrameGroup(AbstractGroup):
         """Velocities of the frames."""
         single = lambda at, x, v: at(now.t).velocity(self._space, x[0], v[0], *at(now.t).modal(x), *at(now.t).modal(v))
         return self._map(single, now.poses, now.velocities)
+
+    @property
+    def quantities(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of the quantities that the frames have because they move in their bodies."""
+        part, d = self.group.part, self._space.dimension
+        shapes = part.quantities if part.is_flexible else {}
+        return {name: tuple(d if size == "d" else size for size in shape) for name, shape in shapes.items()}
+
+    def measured(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
+        """These quantities."""
+        return self._map(lambda at, x: at(t).measured(self._space, *at(t).modal(x)), poses)
 
 
 class AbstractConstraintGroup(AbstractGroup):

@@ -130,7 +130,7 @@ def frame_measures(groups: Sequence[FrameGroup], layout: Layout) -> dict[str, Me
     out = {}
     for g, group in enumerate(groups):
         for k, name in enumerate(group.group.names):
-            for field, shape in (at_velocities | at_accelerations).items():
+            for field, shape in (at_velocities | at_accelerations | group.quantities).items():
                 of_forces = field in at_accelerations
                 out[f"{name}.{field}"] = Measure(shape, _of_frame, (g, field, of_forces, np.array(k)), of_forces)
     return out
@@ -158,6 +158,8 @@ def _fields(system, frame, t, y, acceleration):
     velocity, angular_velocity = rates(t, y.q, y.u)
     out = {"position": pose[:d], "velocity": velocity, "angular_velocity": angular_velocity}
     out |= {"angle": pose[2]} if d == 2 else {"orientation": pose[3:7]}
+    if frame.quantities:
+        out |= {name: x[0] for name, x in frame.measured(t, system.bodies.prepared_poses(y.q)).items()}
     if acceleration is not None:
         t = jnp.asarray(t, y.q.dtype)
         along = (jnp.ones_like(t), system.rates(t, y.q, y.u), acceleration)

@@ -381,7 +381,8 @@ class RigidBodySystem(AbstractSystem):
         if mass is None and not self.layout.flexible:
             mass = self.bodies.inertia(self.guess.q, self.constraints.scalar_inertias)
             mass = mass.with_inverse(self.guess.u) if self.spatial and self.acceleration_rows else mass
-        return dataclasses.replace(self, constraints=self.constraints.prepared(), mass_matrix=mass)
+        constraints, bodies = self.constraints.prepared(), self.bodies.prepared()
+        return dataclasses.replace(self, constraints=constraints, bodies=bodies, mass_matrix=mass)
 
     def closing(self):
         # In the plane a residual distinguishes full turns; a product of vectors does not.

@@ -268,6 +268,13 @@ class AbstractFlexibleBody(AbstractBody):
     def mass_matrix(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> Float[Array, "n n"]:
         """M(ζ) for the velocities w: 3 + k rows in the plane, 6 + k in space."""
 
+    def prepared(self, space: AbstractSpace) -> Any:
+        """Hook: an object with the same kernels, for the steps of a motion, that holds values of the numbers alone; by
+        default the body. A class of a user has its kernels themselves.
+        """
+        del space
+        return self
+
     def energy(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> Float[Array, ""]:
         """Hook: the elastic energy [J]."""
         del space

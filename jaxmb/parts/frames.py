@@ -1,8 +1,9 @@
 """Named frames in bodies, which parts may act on and whose motion may be observed."""
 
 import abc
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -165,6 +166,25 @@ class AbstractFlexibleFrame(AbstractFrame):
     Parts that name it load the modal coordinates too. Its velocity and the forces along ζ follow from its pose.
     """
 
+    # Shapes of the quantities that `measured` gives, with `"d"` for the dimension of the space.
+    quantities: ClassVar[Mapping[str, tuple[Any, ...]]] = MappingProxyType({"deflection": ("d",)})
+
+    def placed(self, body: AbstractFlexibleBody) -> Self:
+        """Hook: the frame in this body. A frame whose pose depends on the body's numbers is a copy that holds the body,
+        in a field declared with `part`.
+
+        **Raises:** `ValueError` for a body in which it cannot be.
+        """
+        del body
+        return self
+
+    def measured(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> dict[str, Array]:
+        """Hook: further quantities along a motion by name, such as the `deflection`, the displacement [m] of the origin
+        in the body's axes.
+        """
+        origin = jnp.zeros(space.dimension, zeta.dtype)
+        return {"deflection": self.point(space, origin, zeta) - self.point(space, origin, jnp.zeros_like(zeta))}
+
     @abc.abstractmethod
     def pose_at(self, space: AbstractSpace, pose: Pose, zeta: Float[Array, "k"]) -> Pose:
         """The frame's pose, without prepared quantities, from the body's and from ζ."""
@@ -252,7 +272,7 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
     def based(name, path):
         if name in out or name not in given:
             return
-        frame = given[name]
+        frame: Any = given[name]
         if name in path:
             raise ValueError(f"{frame.label} is fixed in itself, by way of {', '.join(map(repr, path))}.")
         if frame.body not in (*given, *bodies_by_name, GROUND):
@@ -262,7 +282,7 @@ def frames_by_name(frames: Sequence[AbstractFrame], bodies: Sequence[AbstractBod
         if isinstance(frame, AbstractFixedFrame):
             out[name] = frame.with_fields(base=out.get(frame.body))
         elif isinstance(bodies_by_name.get(frame.body), AbstractFlexibleBody):
-            out[name] = frame
+            out[name] = frame.placed(bodies_by_name[frame.body])
         else:
             raise ValueError(
                 f"{frame.label} moves with modal coordinates, and {frame.body!r} has none; name a flexible body, or "

@@ -82,6 +82,12 @@ class AbstractSpace(abc.ABC):
         """Body components of a world direction."""
 
     @abc.abstractmethod
+    def displaced(self, pose: Pose, origin: Point, turn: Float[Array, "r"]) -> Pose:
+        """The pose of a frame at a body-fixed point [m], without prepared quantities, whose axes turn by a small vector
+        [rad] in body axes: about its direction by `2 arctan(|turn| / 2)`.
+        """
+
+    @abc.abstractmethod
     def prepare(self, pose: Pose) -> Pose:
         """The pose with quantities that all parts on a body share (cosines), computed once."""
 

@@ -15,6 +15,8 @@ from .._moved import tell_of_moved as _tell_of_moved
 from ..parts.planar.bodies import Body as Body, PointMass as PointMass, AbstractRigidBody as AbstractRigidBody
 from ..parts.planar.bodies import rod as rod, box as box, disc as disc
 from ..parts.planar.frames import Frame as Frame
+from ..parts.planar.elastic import ElasticBody as ElasticBody, ElasticBar as ElasticBar
+from ..parts.elastic import ModalFrame as ModalFrame, BarFrame as BarFrame
 
 ## Joints
 from ..parts.planar.joints import (

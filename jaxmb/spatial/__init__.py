@@ -23,6 +23,8 @@ from ..parts.spatial.bodies import (
     sphere as sphere,
 )
 from ..parts.spatial.frames import Frame as Frame
+from ..parts.spatial.elastic import ElasticBody as ElasticBody, ElasticBar as ElasticBar
+from ..parts.elastic import ModalFrame as ModalFrame, BarFrame as BarFrame
 
 ## Joints
 from ..parts.spatial.joints import (

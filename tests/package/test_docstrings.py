@@ -72,6 +72,7 @@ AFTER = {
     "robust": "optimise",
     "Floquet": "floquet",
     "parts.AbstractFlexibleFrame": "parts.AbstractFlexibleBody",
+    "planar.ModalFrame": "planar.ElasticBody",
     "viz.plot_root_locus": "root_locus",
     "viz.plot_sweep": "sweep",
 }

@@ -150,8 +150,8 @@ def on_the_ground():
 
 
 OF_BOTH = (
-    "Body, PointMass, SpringDamper, Damper, PointForce, Torque, RotationalDamper, Bushing, Beam, Cylinder, Contact, "
-    "Tyre"
+    "Body, ElasticBar, ElasticBody, PointMass, SpringDamper, Damper, PointForce, Torque, RotationalDamper, Bushing, "
+    "Beam, Cylinder, Contact, Tyre"
 )
 PLANAR_FORCES = named("planar", f"{OF_BOTH}, TorsionalSpringDamper, DraftGear, Track, PlateContact, DiscContact")
 SPATIAL_FORCES = named("spatial", f"{OF_BOTH}, MagicFormulaTyre")

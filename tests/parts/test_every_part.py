@@ -268,14 +268,14 @@ def test_spring_of_zero_length(space, free_length):
 
 
 def test_every_part_has_a_case():
-    """Friction and cylinders stand in scenes alone."""
+    """Friction, cylinders and elastic bodies stand in scenes alone."""
     for space, module in (("planar", planar), ("spatial", spatial)):
         bodies = (
             module.Body("a", mass=1.0, inertia=1.0 if space == "planar" else np.eye(3)),
             module.PointMass("b", mass=1.0),
         )
         # A tyre by the Magic Formula has a file of its own, too.
-        others = ["Driver", "Friction", "Cylinder", "MagicFormulaTyre"]
+        others = ["Driver", "Friction", "Cylinder", "ElasticBar", "ElasticBody", "MagicFormulaTyre"]
         tables = JOINTS[space], ROLLING[space].values(), forces(space).values(), bodies, others
         assert not missing(module, PARTS, *tables)
         (known,) = (own.of for own in fields.declarations(module.Driver).values() if own.kind == "choice")

@@ -146,9 +146,25 @@ DRAFT_GEAR = {"stiffness": 300.0, "preload": 5.0, "travel": 0.2, "stop_stiffness
 DRAFT_GEAR |= {"smoothing": 0.05}
 POINT_MASS_2D = planar.PointMass("PointMass", mass=1.2, position=(0.4, 0.2))
 BODY_2D = body_2d("Body", velocity=(1.0, 0.0))
+BAR = {"length": 0.5, "young": 1e6, "density": 900.0, "width": 0.06, "thickness": 0.04, "bending": 2}
+BAR_2D = planar.ElasticBar("ElasticBar", position=(0.3, 0.2), angle=0.1, **BAR)
+ELASTIC_2D = planar.ElasticBody(
+    "ElasticBody",
+    mass=1.3,
+    first_moment=(0.1, 0.02),
+    second_moment=((0.2, 0.01), (0.01, 0.1)),
+    modal_moments=((0.0, 0.3),),
+    mixed_moments=(((0.0, 0.1), (0.0, 0.02)),),
+    modal_products=((((0.05, 0.0), (0.0, 0.3)),),),
+    stiffness=((60.0,),),
+    damping=((0.5,),),
+    position=(0.4, 0.1),
+)
 
 PLANAR = [
     Example(BODY_2D, [BODY_2D], "inertia", (), (hold_2d(BODY_2D),)),
+    Example(BAR_2D, [BAR_2D], "thickness", (), (hold_2d(BAR_2D),)),
+    Example(ELASTIC_2D, [ELASTIC_2D], "stiffness", (), (hold_2d(ELASTIC_2D),)),
     Example(POINT_MASS_2D, [POINT_MASS_2D], "mass", (), (hold_2d(POINT_MASS_2D),)),
     of_ground_2d(planar.Revolute, "point_b", point=(0.0, 0.0)),
     of_ground_2d(planar.Fixed, "angle", point=(0.0, 0.0)),
@@ -391,10 +407,25 @@ def roped_3d():
 O = (0.0, 0.0, 0.0)
 POINT_MASS_3D = spatial.PointMass("PointMass", mass=1.2, position=(0.4, 0.2, 0.1))
 BODY_3D = body_3d("Body", angular_velocity=(1.0, 2.0, 0.5))
+BAR_3D = spatial.ElasticBar("ElasticBar", position=(0.3, 0.2, 0.1), torsion=1, **BAR | {"bending": 1})
+ELASTIC_3D = spatial.ElasticBody(
+    "ElasticBody",
+    mass=1.3,
+    first_moment=(0.1, 0.02, 0.03),
+    second_moment=np.diag([0.2, 0.15, 0.1]),
+    modal_moments=((0.0, 0.3, 0.0),),
+    mixed_moments=(((0.0, 0.1, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.0)),),
+    modal_products=np.diag([0.05, 0.3, 0.02])[None, None],
+    stiffness=((60.0,),),
+    damping=((0.5,),),
+    position=(0.4, 0.1, 0.2),
+)
 
 SPATIAL = [
     of_ground_3d(spatial.RotationalDamper, "damping", damping=0.3),
     Example(BODY_3D, [BODY_3D], "inertia", (), (hold_3d(BODY_3D),)),
+    Example(BAR_3D, [BAR_3D], "width", (), (hold_3d(BAR_3D),)),
+    Example(ELASTIC_3D, [ELASTIC_3D], "stiffness", (), (hold_3d(ELASTIC_3D),)),
     Example(POINT_MASS_3D, [POINT_MASS_3D], "mass", (), (hold_3d(POINT_MASS_3D),)),
     of_ground_3d(spatial.Spherical, "point_b", point=O),
     of_ground_3d(spatial.Revolute, "point_b", point=O, axis=AXIS),

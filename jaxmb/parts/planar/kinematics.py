@@ -52,6 +52,10 @@ class PlanarSpace(AbstractSpace):
     def body_direction(self, pose, v_W):
         return _turned_back(pose, v_W)
 
+    def displaced(self, pose, origin, turn):
+        xp = namespace(pose, origin, turn)
+        return xp.concatenate([self.point(pose, origin), pose[2:3] + 2 * xp.arctan(turn / 2)])
+
     def prepare(self, pose):
         xp = namespace(pose)
         return xp.concatenate([pose, xp.cos(pose[2:3]), xp.sin(pose[2:3])])

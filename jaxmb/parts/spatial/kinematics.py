@@ -92,6 +92,11 @@ class SpatialSpace(AbstractSpace):
     def body_direction(self, pose, v_W):
         return _turned_back(pose, v_W)
 
+    def displaced(self, pose, origin, turn):
+        xp = namespace(pose, origin, turn)
+        turned = rot.normalize(xp.concatenate([xp.ones_like(turn[:1]), turn / 2]))
+        return xp.concatenate([self.point(pose, origin), rot.multiply(pose[3:7], turned)])
+
     def prepare(self, pose):
         return namespace(pose).concatenate([pose, rot.rotation_matrix(pose[3:]).reshape(-1)])
 
