@@ -449,9 +449,9 @@ class FrameGroup(AbstractGroup):
     @property
     def quantities(self) -> dict[str, tuple[int, ...]]:
         """The shapes of the quantities that the frames have because they move in their bodies."""
-        part, d = self.group.part, self._space.dimension
-        shapes = part.quantities if part.is_flexible else {}
-        return {name: tuple(d if size == "d" else size for size in shape) for name, shape in shapes.items()}
+        sizes: dict[Any, Any] = {"d": self._space.dimension}
+        shapes = self.group.part.quantities
+        return {name: tuple(sizes.get(size, size) for size in shape) for name, shape in shapes.items()}
 
     def measured(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
         """These quantities."""

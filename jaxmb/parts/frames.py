@@ -32,6 +32,8 @@ class AbstractFrame(AbstractPart):
     name: str = fields.name()
     body: str = fields.body_name()
     rows: tuple[int, int] = eqx.field(static=True, default_factory=lambda: (0, 0), init=False)
+    # Further quantities along a motion, from a method `measured`: their shapes by name, with `"d"` for the dimension.
+    quantities: ClassVar[Mapping[str, tuple[Any, ...]]] = MappingProxyType({})
 
     @property
     @abc.abstractmethod
@@ -166,7 +168,6 @@ class AbstractFlexibleFrame(AbstractFrame):
     Parts that name it load the modal coordinates too. Its velocity and the forces along ζ follow from its pose.
     """
 
-    # Shapes of the quantities that `measured` gives, with `"d"` for the dimension of the space.
     quantities: ClassVar[Mapping[str, tuple[Any, ...]]] = MappingProxyType({"deflection": ("d",)})
 
     def placed(self, body: AbstractFlexibleBody) -> Self:
