@@ -449,7 +449,8 @@ class FrameGroup(AbstractGroup):
     @property
     def quantities(self) -> dict[str, tuple[int, ...]]:
         """The shapes of the quantities that the frames have because they move in their bodies."""
-        sizes, shapes = {"d": self._space.dimension}, self.group.part.quantities
+        sizes: dict[Any, Any] = {"d": self._space.dimension}
+        shapes = self.group.part.quantities
         return {name: tuple(sizes.get(size, size) for size in shape) for name, shape in shapes.items()}
 
     def measured(self, t: Scalar, poses: BodyPoses) -> dict[str, Float[Array, "parts *shape"]]:
