@@ -24,7 +24,7 @@ from jaxmb.parts import AbstractCompound, AbstractConstraint, AbstractVelocityCo
 from jaxmb.reference import topics
 from jaxmb.reference.entries import entries, members
 
-MOST_PROGRAMS = 300
+MOST_PROGRAMS = 340
 
 MODULES = {"jax": jax, "jnp": jnp, "np": np, "jaxmb": mb, "mb": mb, "planar": planar, "spatial": spatial}
 # The coordinates of the joints in their examples, at the given poses.
