@@ -1,5 +1,6 @@
 """Bodies with modal coordinates move as rigid bodies that slide in each other, and by Lagrange's equations."""
 
+import contextlib
 import dataclasses
 import functools
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flexible_bodies import AXIS, OnSlide, PlanarSlider, as_flexible, planar_pendulum, spatial_loop
+from precision import single_precision
 
 import jaxmb as mb
 from jaxmb import parts, planar, spatial
@@ -298,6 +300,18 @@ REFUSED = {
         "'end' has none; name a flexible body",
     ),
 }
+
+
+def test_flexible_body_in_single_precision():
+    """Accelerations of a pendulum, near those in double precision."""
+    out = []
+    for precision in (contextlib.nullcontext, single_precision):
+        with precision():
+            system = planar_pendulum(True).compile()
+            q = jnp.array([0.2 * np.sin(0.3), -0.2 * np.cos(0.3), 0.3, 0.05], system.guess.q.dtype)
+            out.append(np.asarray(jax.jit(lambda s, q: accelerations(s, Multipliers(), 0.0, q, 0 * q)[0])(system, q)))
+    assert [x.dtype for x in out] == [np.float64, np.float32]
+    np.testing.assert_allclose(out[1], out[0], rtol=1e-4, atol=1e-4)
 
 
 def test_flexible_body_is_not_exported():
