@@ -74,6 +74,7 @@ from .studies.identify import (
 
 ## Optimisation
 from .studies.optimise import optimise as optimise, Optimum as Optimum, robust as robust
+from .studies.plan import plan as plan, Plan as Plan
 
 ## Small motions
 from .studies.linear import (

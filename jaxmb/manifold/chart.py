@@ -107,7 +107,13 @@ class Chart(eqx.Module):
 
     def field(self, t: Scalar, x: Float[Array, "n"], near: State | None = None) -> Float[Array, "n"]:
         """The rates of x by the equations of motion; NaN where no state is found. Arguments as of `state`."""
-        return _field(self, t, x, near)
+        return self.moving(t, x, near)[1]
+
+    def moving(
+        self, t: Scalar, x: Float[Array, "n"], near: State | None = None
+    ) -> tuple[State, Float[Array, "n"]]:
+        """The state on the constraints, as `state`, and the rates of x there, as `field`; both in one computation."""
+        return _moving(self, t, x, near)
 
     def quality(self, t: Scalar, state: State) -> Float[Array, ""]:
         """How much more dependent coordinates change with the independent ones than at the origin: 1 there. From about
@@ -239,11 +245,12 @@ def choose(at: Instant, of_coordinates: Any, preferred: Any = None) -> tuple[Abs
 
 
 @eqx.filter_jit
-def _field(chart, t, x, near):
+def _moving(chart, t, x, near):
     at, failed = _state(chart, t, x, near)
     out = acceleration(at, Partitioned(), chart.split)
-    rates = chart.coordinates(at.with_(u=out.u).motion(out.udot))
-    return rates * jnp.where(failed | out.failed, jnp.nan, 1.0).astype(rates.dtype)
+    at = at.with_(u=out.u)
+    rates = chart.coordinates(at.motion(out.udot))
+    return at.state, rates * jnp.where(failed | out.failed, jnp.nan, 1.0).astype(rates.dtype)
 
 
 def _growth(chart, at):

@@ -1,9 +1,12 @@
 """Quantities at one state by name."""
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Array
 
 from .._arguments import real_array
@@ -20,6 +23,7 @@ from ..system.quantities import Solved
 from ..trajectory import still
 from .linear.quantities import checked_names
 
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 _ENERGIES = ("energy", "kinetic_energy", "potential_energy")
 
 
@@ -40,7 +44,7 @@ def evaluate(system: AbstractSystem, state: State, names: str | Sequence[str], *
     - `system`, and a `state` on its constraints, as from `assemble`, `equilibrium` or `motion.end`.
     - `names`: one name or several.
         - Quantities, as `Trajectory.quantity` takes them: coordinates of joints, tendons and ropes with their rates and
-            accelerations; `"pin.force"` and `"pin.moment"` of joints; motions of bodies and frames; internal states.
+            accelerations; coordinates of bodies with their rates, `"bar.x"`, `"bar.angle_rate"`; `"pin.force"` and `"pin.moment"` of joints; motions of bodies and frames; internal states.
             `system.quantities()` lists them.
         - `"energy"`, `"kinetic_energy"` and `"potential_energy"` [J].
         - Names of force elements: the wrenches on their bodies, as in `Trajectory.forces`.
@@ -57,23 +61,59 @@ def evaluate(system: AbstractSystem, state: State, names: str | Sequence[str], *
     """
     chosen = checked_names("quantity", (names,) if isinstance(names, str) else names)
     state = checked_state(system, state)
-    motion = still(system, state, real_array("t", t, state.q.dtype))
-    catalogue = system.catalogue
-    measures, forces = catalogue.measures(), catalogue.force_names() if system.body_names else ()
+    reading = Reading(system, state, real_array("t", t, state.q.dtype))
     for name in chosen:
-        if name not in measures and name not in (*_ENERGIES, *forces):
-            raise unknown("quantity", name, (*measures, *_ENERGIES, *forces))
-    of_forces = any(measures[name].of_forces if name in measures else name not in _ENERGIES for name in chosen)
-    solved = _solved(motion) if of_forces else None
-    values = {name: _value(motion, measures, name, solved) for name in chosen}
+        reading.check(name)
+    values = {name: reading[name] for name in chosen}
     return values[names] if isinstance(names, str) else values
 
 
-def _value(motion, measures, name, solved) -> Array:
-    if name in measures:
-        measure = measures[name]
-        return _quantity(motion, measure.view, measure.place, solved if measure.of_forces else None)
-    return _energy(motion, name) if name in _ENERGIES else _wrenches(motion, name, solved)
+class Reading:
+    """A system at one instant, for functions of it: `at["pin.force"]` is a quantity, as of `evaluate`, and `at["time"]`
+    the time [s].
+
+    **Fields:** the `system`, the `state` and the time `t`; `given`: further values by name.
+    """
+
+    def __init__(self, system: AbstractSystem, state: State, t: Scalar, given: Mapping[str, Array] = _NOTHING):
+        self.system, self.state, self.t, self.given = system, state, t, {"time": t, **given}
+        self._motion = still(system, state, t)
+        self._measures = system.catalogue.measures()
+        self._coordinates = {
+            name: (vector, places)
+            for vector, names in (("q", system.coordinate_names()), ("u", system.rate_names()))
+            for name, places in names.items()
+        }
+        self._wrenches = system.catalogue.force_names() if system.body_names else ()
+
+    @functools.cached_property
+    def _solved(self) -> Solved:
+        return _solved(self._motion)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names."""
+        return (*self._measures, *self._coordinates, *_ENERGIES, *self._wrenches, *self.given)
+
+    def check(self, name: str) -> None:
+        """Raise a `ValueError` for an unknown name, with the nearest ones."""
+        if name not in self.names:
+            raise unknown("quantity", name, self.names)
+
+    def __getitem__(self, name: str) -> Array:
+        self.check(name)
+        if name in self.given:
+            return self.given[name]
+        if name in self._measures:
+            measure = self._measures[name]
+            return _quantity(self._motion, measure.view, measure.place, self._solved if measure.of_forces else None)
+        if name in self._coordinates:
+            vector, places = self._coordinates[name]
+            values = getattr(self.state, vector)[np.asarray(places)]
+            return values if len(places) > 1 else values[0]
+        if name in _ENERGIES:
+            return _energy(self._motion, name)
+        return _wrenches(self._motion, name, self._solved)
 
 
 def _short(function: Callable[..., Any]) -> Callable[..., Any]:

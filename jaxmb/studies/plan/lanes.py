@@ -1,0 +1,228 @@
+"""Intervals and nodes of a plan, computed side by side: values, first and second derivatives by their inputs."""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ..._types import State
+from ...linalg.jitted import jitted
+from ...manifold import Chart
+from ...system import AbstractSystem, with_inputs, with_parameters
+from ..evaluate import Reading
+from .courses import AbstractCourse, Piece
+
+# The number of lanes of one program, whatever the number of intervals.
+_TOGETHER = 8
+# The step of differences of first derivatives, in units of the scales of the inputs.
+_ASIDE = 1e-6
+
+
+def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The stages of a Runge–Kutta method of order eight: their times, the matrix of their weights, and the weights of
+    the result.
+    """
+    tableau: Any = diffrax.Dopri8.tableau
+    stages = len(tableau.c) + 1
+    matrix = np.zeros((stages, stages))
+    for k, row in enumerate(tableau.a_lower):
+        matrix[k + 1, : len(row)] = row
+    used = np.flatnonzero(np.any(matrix != 0, axis=0) | (np.asarray(tableau.b_sol) != 0))
+    return np.append(0.0, tableau.c)[used], matrix[np.ix_(used, used)], np.asarray(tableau.b_sol)[used]
+
+
+class Control(NamedTuple):
+    """A control: the parameter's `name` and `shape`, and its `course` between nodes."""
+
+    name: str
+    shape: tuple[int, ...]
+    course: AbstractCourse
+
+    @property
+    def size(self) -> int:
+        """The count of components."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+class Model(eqx.Module):
+    """A system with controls and designed parameters.
+
+    **Fields:** the `system`; its `controls`; `design`: the names and shapes of designed parameters.
+    """
+
+    system: AbstractSystem
+    controls: tuple[Control, ...] = eqx.field(static=True)
+    design: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    def designed(self, numbers: Float[Array, "design"]) -> AbstractSystem:
+        """The system with these values of designed parameters."""
+        if not self.design:
+            return self.system
+        return with_parameters(self.system, _by_name(self.design, numbers))
+
+    def given(self, t: Any, controls: dict[str, Array], numbers: Any) -> dict[str, Array]:
+        """The controls and designed parameters by name, for functions of an instant."""
+        del t
+        return {**controls, **_by_name(self.design, numbers)}
+
+
+def _by_name(shapes, numbers):
+    sizes = [int(np.prod(shape, dtype=int)) for _, shape in shapes]
+    parts = jnp.split(numbers, np.cumsum(sizes)[:-1]) if sizes else []
+    return {name: part.reshape(shape) for (name, shape), part in zip(shapes, parts, strict=True)}
+
+
+class AbstractLane(eqx.Module):
+    """A function of the inputs of one interval or node, near the state where its chart was made."""
+
+    model: eqx.AbstractVar[Model]
+
+    @abc.abstractmethod
+    def __call__(self, chart: Any, inputs: Float[Array, "inputs"], steps: Int[Array, ""]) -> Float[Array, "outputs"]:
+        """**Arguments:** `chart`: all fields of a `Chart` but its system; `steps` of an interval."""
+
+
+class Arrival(AbstractLane):
+    """The state at the end of an interval, and the integral over it.
+
+    The inputs are the coordinates of the start in its chart, the time of the start and the length [s], the numbers of
+    the controls, and the designed parameters. The outputs are all coordinates, velocities and internal states at the
+    end, and the integral of `running(at)` over the interval.
+    """
+
+    model: Model
+    running: Callable[[Reading], Any] | None = eqx.field(static=True)
+
+    def __call__(self, chart, inputs, steps):
+        model = self.model
+        n, sizes = chart[1].size, [control.size * control.course.local for control in model.controls]
+        x, (t0, h), *numbers, design = jnp.split(inputs, np.cumsum([n, 2, *sizes]))
+        pieces = {}
+        for control, own in zip(model.controls, numbers, strict=True):
+            own = own.reshape(control.course.local, *control.shape)
+            pieces[control.name] = Piece(control.course.powers(own, h), t0, h, control.course.smooth)
+        system = with_inputs(model.designed(design), pieces) if pieces else model.designed(design)
+        here = Chart(system, *chart)
+        times, matrix, weights = (jnp.asarray(array, x.dtype) for array in _tableau())
+        step = h / steps
+
+        def stage(k, carry):
+            y, near, slopes = carry
+            number, count = k % times.size, k // times.size
+            t = t0 + step * (count + times[number])
+            inner = y + step * (matrix[number] @ slopes)
+            state, rates = here.moving(t, inner[:n], near)
+            cost = jnp.zeros(()) if self.running is None else self._cost(system, state, t, pieces, design)
+            slopes = slopes.at[number].set(jnp.append(rates, cost))
+            y = jnp.where(number == times.size - 1, y + step * (weights @ slopes), y)
+            return y, lax.stop_gradient(state), slopes
+
+        start = jnp.append(x, 0.0), State(*jax.tree.map(jnp.asarray, _plain(chart[0]))), jnp.zeros((times.size, n + 1))
+        y, near, _ = lax.fori_loop(0, steps * times.size, stage, start)
+        end = here.state(t0 + h, y[:n], near)
+        return jnp.concatenate([*_plain(end)[: 2 if end.z is None else 3], y[n:]])
+
+    def _cost(self, system, state, t, pieces, design):
+        given = self.model.given(t, {name: piece(t) for name, piece in pieces.items()}, design)
+        return jnp.asarray(self.running(Reading(system, state, t, given)))
+
+
+def _plain(state):
+    return state.q, state.u, state.z
+
+
+class Look(AbstractLane):
+    """Quantities at a node, by the numbers of a function of the instant.
+
+    The inputs are the coordinates in the chart, the time, the values of the controls, and the designed parameters.
+    """
+
+    model: Model
+    function: Callable[[Reading], Any] = eqx.field(static=True)
+
+    def __call__(self, chart, inputs, steps):
+        del steps
+        model = self.model
+        sizes = [control.size for control in model.controls]
+        x, (t,), *values, design = jnp.split(inputs, np.cumsum([chart[1].size, 1, *sizes]))
+        each = zip(model.controls, values, strict=True)
+        controls = {control.name: value.reshape(control.shape) for control, value in each}
+        system = model.designed(design)
+        system = with_parameters(system, controls) if controls else system
+        state = Chart(system, *chart).state(t, x)
+        numbers = self.function(Reading(system, state, t, model.given(t, controls, design)))
+        return jnp.concatenate([jnp.ravel(jnp.asarray(number, x.dtype)) for number in jax.tree.leaves(numbers)])
+
+
+@functools.partial(jitted)
+def _linearised(lane, charts, inputs, steps, active):
+    """The outputs of lanes, and their derivatives by the active inputs."""
+
+    def of_one(chart, whole):
+        def outputs(part):
+            y = lane(chart, whole.at[np.array(active, int)].set(part), steps)
+            return y, y
+
+        jacobian, y = jax.jacfwd(outputs, has_aux=True)(whole[np.array(active, int)])
+        return y, jacobian
+
+    return jax.vmap(of_one)(charts, inputs)
+
+
+class Block:
+    """Lanes of one kind with all their charts.
+
+    **Fields:** the `lane`; `charts`: stacked along axis 0; `active`: the inputs that are variables; `steps` of each
+    interval.
+    """
+
+    def __init__(self, lane: AbstractLane, charts: Any, active: tuple[int, ...], steps: int = 1):
+        self.lane, self.charts, self.active, self.steps = lane, charts, active, steps
+
+    def linearised(self, inputs: np.ndarray, steps: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs, and their derivatives by the active inputs; axis 0 is the lane.
+
+        **Arguments:** `steps` of each interval, default the block's.
+        """
+        lanes = len(inputs)
+        order = np.arange(-(-lanes // _TOGETHER) * _TOGETHER)
+        return self._computed(inputs, np.minimum(order, lanes - 1), self.steps if steps is None else steps)
+
+    def _computed(self, inputs, charts_of, steps):
+        """As `linearised`, for lanes whose charts have the numbers `charts_of`."""
+        lanes, results = len(inputs), []
+        padded = inputs[np.minimum(np.arange(len(charts_of)), lanes - 1)]
+        for begin in range(0, len(charts_of), _TOGETHER):
+            these = charts_of[begin : begin + _TOGETHER]
+            charts = jax.tree.map(lambda x, these=these: x[these], self.charts)
+            block = padded[begin : begin + _TOGETHER]
+            results.append(_linearised(self.lane, charts, block, np.asarray(steps), self.active))
+        outputs, jacobians = (np.concatenate([np.asarray(x) for x in parts]) for parts in zip(*results, strict=True))
+        return outputs[:lanes], jacobians[:lanes]
+
+    def curvature(
+        self, inputs: np.ndarray, first: np.ndarray, weights: np.ndarray, scales: np.ndarray, central: bool = False
+    ) -> np.ndarray:
+        """The second derivatives of each lane's weighted sum of outputs, by differences of `first`, its derivatives."""
+        lanes, count = len(inputs), len(self.active)
+        # Inputs of a lane that depend on no variable have no scale.
+        aside = _ASIDE * np.where(scales > 0, scales, 1.0)
+        sides = (1.0, -1.0) if central else (1.0,)
+        moved = np.concatenate([inputs] * (count * len(sides)))
+        for number, (side, k) in enumerate((side, k) for side in sides for k in range(count)):
+            moved[number * lanes : (number + 1) * lanes, self.active[k]] += side * aside[:, self.active[k]]
+        whole = -(-len(moved) // _TOGETHER) * _TOGETHER
+        charts_of = np.minimum(np.arange(whole), len(moved) - 1) % lanes
+        slopes = self._computed(moved, charts_of, self.steps)[1].reshape(len(sides), count, lanes, *first.shape[1:])
+        change = slopes[0] - slopes[1] if central else slopes[0] - first
+        width = (len(sides) * aside[:, list(self.active)]).T
+        second = np.einsum("kloj,lo->lkj", change, weights) / width.T[:, :, None]
+        return 0.5 * (second + second.transpose(0, 2, 1))

@@ -1,0 +1,161 @@
+"""Optimal control: controls, duration and parameters of a motion between two ends that minimise an objective."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from ..._arguments import check_kind, real_array, whole_number
+from ..._types import State
+from ...parts.names import names_arguments
+from ...simulate.arguments import checked_state
+from ...system import AbstractSystem
+from ...system.design import Bounds
+from .guess import first_guess
+from .result import Plan
+from .solve import Iteration, solved
+from .task import (
+    Effort,
+    Task,
+    checked_controls,
+    checked_design,
+    checked_duration,
+    checked_limits,
+    checked_shares,
+)
+
+_OBJECTIVES = "running= a function of the instant or 'effort', or final= a function of the end or 'time'"
+
+
+@names_arguments
+def plan(
+    system: AbstractSystem,
+    *,
+    controls: Mapping[str, Bounds | None],
+    duration: float | tuple[float, float],
+    start: State | Mapping[str, Any],
+    end: State | Mapping[str, Any] | None = None,
+    running: Callable[..., Any] | Literal["effort"] | None = None,
+    final: Callable[..., Any] | Literal["time"] | None = None,
+    path: Mapping[str, Any] | None = None,
+    design: Mapping[str, Bounds] | None = None,
+    periodic: bool = False,
+    intervals: int | ArrayLike = 32,
+    interpolation: Literal["held", "linear", "cubic"] = "linear",
+    moving: bool = False,
+    guess: Any = None,
+    t0: float = 0.0,
+    method: Literal["ipopt", "slsqp"] | None = None,
+    max_iterations: int = 300,
+    tol: float = 1e-8,
+    verbose: bool = False,
+) -> Plan:
+    """Find the best controls of a machine between two ends: optimal control, also over closed loops and rolling.
+
+    ```python
+    rest = {"pin.angle": 0.0, "pin.angle_rate": 0.0}
+    turned = {"pin.angle": 1.0, "pin.angle_rate": 0.0}
+    best = jaxmb.plan(system, controls={"motor.force": (-2, 2)}, duration=1.0, start=rest, end=turned, running="effort")
+    best.objective, best.controls["motor.force"], best.trajectory["bar"].angle
+    ```
+
+    The objective is the integral of `running` plus `final`; it is minimised by multiple shooting. The unknowns of each
+    node are independent coordinates and rates, so every state is on the constraints.
+
+    **Arguments:**
+
+    - `controls`: bounds `(low, high)` of parameters that become functions of time, either of them None, or None
+        without bounds; parameters as of `with_inputs`.
+    - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
+    - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
+        high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. The others are free.
+    - `running`: a function of the instant by names, `lambda at: at["motor.force"] ** 2`; or `"effort"`, the sum of the
+        squares of the controls.
+    - `final`: a function of the end, `lambda at: -at["tip.position"][0]`; or `"time"`, the duration.
+    - `path`: bounds of quantities along the way, `{"A.force": (-500.0, 500.0)}`; they hold at nodes, and
+        `Plan.violation` tells what happens between nodes.
+    - `design`: bounds of parameters that are constant, and optimised as well.
+    - `periodic`: whether the end is the start, up to turns of angles.
+
+    **The method:**
+
+    - `intervals`: their number, or the nodes as ascending shares of the duration from 0 to 1.
+    - `interpolation` of controls: `"held"`, constant on each interval; `"linear"`; `"cubic"`, with continuous rates.
+    - `moving`: whether nodes move, to where controls jump: for least time, with `"held"`.
+    - `guess`: values or functions of time by name, of coordinates, controls, designed parameters and `"duration"`; or a
+        `Trajectory`; or another `Plan`. By default coordinates go straight from start to end, and controls have the
+        values of the system.
+    - `t0` [s]: the time of the start.
+    - `method`: `"ipopt"`, with exact derivatives (the default if `ipyopt` is installed, by the extra `plan`); or
+        `"slsqp"` of SciPy for small plans.
+    - `max_iterations`; `tol`: the tolerance of conditions in units of typical changes, of the objective, and of the
+        errors of integration; `verbose`: whether to print a line for each iteration.
+
+    The optimum is local: another guess may lead to another one. Ctrl-C ends the iteration, and the plan so far is
+    returned. Contacts and dry friction keep the modes of the start; the plan says whether they would change.
+
+    **Returns:** a `Plan`. `success` is False, and `message` says why, if the method did not converge.
+
+    **Raises:** `ValueError` for unknown names, reversed bounds, ends that contradict the constraints, conditions that
+    depend on each other, and a guess that cannot be integrated.
+    """
+    task = _task(
+        system,
+        controls=controls,
+        duration=duration,
+        ends=(start, {} if end is None else end),
+        objective=(running, final),
+        path=path,
+        design=design,
+        periodic=periodic,
+        nodes=(intervals, interpolation, moving),
+        t0=t0,
+    )
+    whole_number("plan: max_iterations", max_iterations)
+    if not tol > 0:
+        raise ValueError(f"plan: tol must be positive, got {tol!r}.")
+    told = _print if verbose else lambda iteration: None
+    return Plan.of(solved(task, first_guess(task, guess), method, max_iterations, tol, told), method, tol)
+
+
+def _print(iteration: Iteration) -> None:
+    number, objective, violation, seconds = iteration
+    print(f"{number:4d}  objective {objective:16.9g}  violation {violation:8.1e}  {seconds:7.1f} s", flush=True)
+
+
+def _task(system, *, controls, duration, ends, objective, path, design, periodic, nodes, t0) -> Task:
+    check_kind("plan: system", system, AbstractSystem, "a compiled scene", "use scene.compile()")
+    intervals, interpolation, moving = nodes
+    chosen, control_bounds = checked_controls(system, controls, interpolation)
+    shapes, design_bounds = checked_design(system, design, chosen)
+    others = {control.name: jnp.zeros(control.shape) for control in chosen}
+    others |= {name: jnp.zeros(shape) for name, shape in shapes} | {"time": jnp.zeros(())}
+    start, end = (
+        checked_state(system, given) if isinstance(given, State) else checked_limits(system, where, given, others)
+        for where, given in zip(("start", "end"), ends, strict=True)
+    )
+    running, final = objective
+    if running is None and final is None:
+        raise ValueError(f"plan: there is nothing to minimise; give {_OBJECTIVES}.")
+    if any(not (given is None or given == word or callable(given)) for given, word in ((running, "effort"), (final, "time"))):
+        raise ValueError(f"plan: give {_OBJECTIVES}; got {running!r} and {final!r}.")
+    return Task(
+        system=system,
+        controls=chosen,
+        control_bounds=control_bounds,
+        design=shapes,
+        design_bounds=design_bounds,
+        t0=float(real_array("plan: t0", t0, float)),
+        duration=checked_duration(duration),
+        shares=checked_shares(intervals),
+        moving=bool(moving),
+        start=start,
+        end=end,
+        path=checked_limits(system, "path", path, others),
+        running=Effort(tuple(control.name for control in chosen)) if running == "effort" else running,
+        final=None if final == "time" else final,
+        of_time=float(final == "time"),
+        periodic=bool(periodic),
+    )

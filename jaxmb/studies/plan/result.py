@@ -1,0 +1,198 @@
+"""The result of a plan: states, controls, prices of conditions, and a check by one simulation."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._printed import Printed
+from ..._types import State
+from ...linalg.jitted import jitted
+from ...parts.series import Series
+from ...simulate.simulate import simulate
+from ...system import AbstractSystem, with_inputs, with_parameters
+from ...trajectory import Trajectory
+from ..evaluate import Reading
+from .lanes import Model
+from .solve import Iteration, Solution
+from .task import Limits
+
+# Saved times in each interval, and the tolerance of the simulation that checks a plan.
+_SAVED, _CHECK = 8, 1e-10
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Plan(Printed):
+    """An optimal motion, the result of `plan`; `print` shows a table.
+
+    **Fields:**
+
+    - `objective`; `duration` [s]; `ts` [s]: the times of the nodes, and `states` there, stacked along axis 0.
+    - `controls`: functions of time by name, `Series` for `simulate(…, inputs=plan.controls)`.
+    - `parameters`: the optimised parameters by name; `system`: the system with them.
+    - `prices`: by how much the objective grows per unit by which a value given at an end grows, or a bound along the way
+        (the extreme value over the nodes), by name; also of a fixed start or end `State`, by coordinate.
+    - `active`: names of controls, parameters and times that are at a bound somewhere, and of bounds along the way.
+    - `iterations`: the log of the method. `success`: whether the method converged; `message`: why it ended.
+    - `integration_error`: the largest error of an interval's end, relative to typical changes.
+    """
+
+    system: AbstractSystem
+    objective: float
+    ts: np.ndarray
+    states: State
+    controls: dict[str, Series]
+    parameters: dict[str, np.ndarray]
+    prices: dict[str, np.ndarray]
+    active: tuple[str, ...]
+    iterations: tuple[Iteration, ...]
+    success: bool
+    message: str
+    integration_error: float
+    solution: Solution
+    method: str | None
+    tol: float
+
+    @classmethod
+    def of(cls, solution: Solution, method: str | None, tol: float) -> "Plan":
+        """The plan of a solution."""
+        task, found = solution.transcription.task, solution.found
+        design = Model(task.system, task.controls, task.design)
+        numbers = [x.reshape(-1, *c.shape) for c, x in zip(task.controls, found.controls, strict=True)]
+        each = zip(task.controls, numbers, strict=True)
+        begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
+        values = {
+            name: found.design[a:b].reshape(shape)
+            for (name, shape), a, b in zip(task.design, begins[:-1], begins[1:], strict=True)
+        }
+        problem = solution.transcription.problem
+        return cls(
+            system=design.designed(jnp.asarray(found.design)),
+            objective=float(problem.at(solution.answer.z).rows[0]) + (0.0 if task.timed else task.of_time * task.duration[0]),
+            ts=found.ts,
+            states=found.states,
+            controls={control.name: control.course.series(found.ts, own) for control, own in each},
+            parameters=values,
+            prices=_prices(solution),
+            active=_active(solution),
+            iterations=solution.iterations,
+            success=solution.answer.success,
+            message=solution.answer.message,
+            integration_error=solution.error,
+            solution=solution,
+            method=method,
+            tol=tol,
+        )
+
+    @property
+    def duration(self) -> float:
+        """The time from start to end [s]."""
+        return float(self.ts[-1] - self.ts[0])
+
+    @functools.cached_property
+    def trajectory(self) -> Trajectory:
+        """One simulation from the start through all intervals with the found controls, with an estimate of its error
+        in `trajectory.error`.
+        """
+        start = jax.tree.map(lambda y: y[0], self.states)
+        times = np.interp(np.linspace(0, len(self.ts) - 1, _SAVED * (len(self.ts) - 1) + 1), range(len(self.ts)), self.ts)
+        return simulate(
+            with_inputs(self.system, self.controls),
+            start,
+            t0=self.ts[0],
+            t1=self.ts[-1],
+            saveat=times,
+            rtol=_CHECK,
+            error=True,
+            throw=False,
+        )
+
+    @functools.cached_property
+    def arrival(self) -> float:
+        """The distance of the end of `trajectory` from the plan's end, relative to the largest coordinates and
+        velocities.
+        """
+        end, there = (jax.tree.map(lambda y: np.asarray(y[-1]), ys) for ys in (self.trajectory.ys, self.states))
+        scale = [max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u)]
+        return float(max(np.max(np.abs(a - b), initial=0.0) / s for a, b, s in zip((end.q, end.u), (there.q, there.u), scale, strict=True)))
+
+    @functools.cached_property
+    def violation(self) -> dict[str, float]:
+        """The largest violation of each bound along the way, at nodes and between them, in its unit; zero within."""
+        limits = self.solution.transcription.task.path
+        if not limits.names:
+            return {}
+        given = {name: jax.vmap(series)(self.trajectory.ts) for name, series in self.controls.items()}
+        values = np.asarray(_along(self.system, limits, self.trajectory.ts, self.trajectory.ys, given))
+        excess = np.maximum(np.maximum(limits.low - values, values - limits.high), 0.0)
+        return dict(zip(limits.components, map(float, np.max(excess, axis=0)), strict=True))
+
+    def __repr__(self) -> str:
+        return f"Plan: objective {self.objective:.6g}, duration {self.duration:.6g} s, {self.message}"
+
+    def __str__(self) -> str:
+        rows: list[tuple[str, ...]] = [("objective", f"{self.objective:.9g}"), ("duration [s]", f"{self.duration:.9g}"), ()]
+        rows.append(("control", "start", "end", "least", "largest"))
+        for name, series in self.controls.items():
+            values = np.asarray(series.values).reshape(len(self.ts), -1)
+            for k, own in enumerate(values.T):
+                label = name if values.shape[1] == 1 else f"{name}[{k}]"
+                rows.append((label, *(f"{x:.6g}" for x in (own[0], own[-1], own.min(), own.max()))))
+        if self.parameters:
+            rows += [(), ("parameter", "value")]
+            rows += [(name, np.array2string(value, precision=6)) for name, value in self.parameters.items()]
+        if self.prices:
+            rows += [(), ("condition", "price")]
+            rows += [(name, np.array2string(value, precision=6)) for name, value in self.prices.items()]
+        if self.active:
+            rows += [(), ("at a bound", ", ".join(self.active))]
+        rows += [(), ("iterations", str(len(self.iterations))), ("error of integration", f"{self.integration_error:.1e}")]
+        width = max(len(row[0]) for row in rows if row)
+        lines = [f"{row[0]:{width}}" + "".join(f"  {cell:>12}" for cell in row[1:]) if row else "" for row in rows]
+        return "\n".join([*(line.rstrip() for line in lines), "", self.message])
+
+
+@jitted
+def _along(system, limits, ts, ys, given):
+    def of_one(t, state, own):
+        now = with_parameters(system, own) if own else system
+        return jnp.concatenate([jnp.ravel(x) for x in limits(Reading(now, state, t, own))])
+
+    return jax.vmap(of_one)(ts, ys, given)
+
+
+def _prices(solution: Solution) -> dict[str, np.ndarray]:
+    transcription, answer = solution.transcription, solution.answer
+    task, out = transcription.task, {}
+    for where, limits in (("start", task.start), ("end", task.end), ("path", task.path)):
+        if not isinstance(limits, Limits):
+            k = 0 if where == "start" else -1
+            names = transcription.names_at(k)
+            values = -answer.of_bounds[transcription.places.x[k]]
+            out |= {f"{where} {name}": value for name, value in zip(names, values, strict=True)}
+        elif limits.names:
+            rows = transcription.rows_of[where] - 1
+            values = (-answer.multipliers[rows].reshape(-1, len(limits.components)) / limits.sizes)
+            chosen = values[np.argmax(np.abs(values), axis=0), np.arange(values.shape[1])]
+            out |= {f"{where} {name}": value for name, value in zip(limits.components, chosen, strict=True)}
+    return out
+
+
+def _active(solution: Solution) -> tuple[str, ...]:
+    transcription, z = solution.transcription, solution.answer.z
+    problem, task, places = transcription.problem, transcription.task, transcription.places
+    at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= 1e-6 * problem.scale
+    out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
+    begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
+    out += [name for (name, _), a, b in zip(task.design, begins[:-1], begins[1:], strict=True) if at_bound[places.design[a:b]].any()]
+    out += ["duration"] if not task.moving and task.timed and at_bound[places.times].any() else []
+    if task.path.names:
+        rows = transcription.rows_of["path"] - 1
+        values = problem.at(z).rows[1:][rows]
+        near = np.minimum(np.abs(values - problem.row_low[rows]), np.abs(values - problem.row_high[rows])) <= 1e-6
+        out += [name for name, is_near in zip(task.path.components, near.reshape(-1, len(task.path.components)).any(axis=0), strict=True) if is_near]
+    return tuple(out)

@@ -1,0 +1,192 @@
+"""What a plan is asked for: controls, ends, bounds along the way and duration, checked and by name."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._arguments import bounds_of, real_array, whole_number
+from ..._types import State
+from ...parts.names import unknown
+from ...system import AbstractSystem, parameters, with_inputs
+from ...system.quantities import component_names
+from ..evaluate import Reading
+from .courses import COURSES, Piece
+from .lanes import Control
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Bounds of quantities by name, component by component: `low` and `high`, equal for equations."""
+
+    names: tuple[str, ...]
+    components: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+
+    def __call__(self, at: Reading) -> list[Any]:
+        """The quantities at an instant."""
+        return [at[name] for name in self.names]
+
+    # Programs are made anew for other names alone.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Limits) and self.names == other.names
+
+    def __hash__(self) -> int:
+        return hash(self.names)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Units of violations: the distance of the bounds, or the larger bound, or 1."""
+        ends = np.maximum(*(np.where(np.isfinite(side), np.abs(side), 0.0) for side in (self.low, self.high)))
+        width = np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
+        size = np.maximum(ends, width)
+        return np.where(size > 0, size, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A plan's problem.
+
+    **Fields:** the `system`; `controls` with `control_bounds`, one pair for each; `design`: names and shapes, with
+    `design_bounds`; `t0`; `duration`: its bounds; `shares`: the nodes as shares of the duration, 0 to 1, or with
+    `moving` nodes their guess; `start` and `end`: a state, or limits; `path`: limits; `running` and `final`: functions
+    of the instant, or None; `of_time`: the weight of the duration in the objective; `periodic`.
+    """
+
+    system: AbstractSystem
+    controls: tuple[Control, ...]
+    control_bounds: tuple[tuple[np.ndarray, np.ndarray], ...]
+    design: tuple[tuple[str, tuple[int, ...]], ...]
+    design_bounds: tuple[tuple[np.ndarray, np.ndarray], ...]
+    t0: float
+    duration: tuple[float, float]
+    shares: np.ndarray
+    moving: bool
+    start: State | Limits
+    end: State | Limits
+    path: Limits
+    running: Callable[[Reading], Any] | None
+    final: Callable[[Reading], Any] | None
+    of_time: float
+    periodic: bool
+
+    @property
+    def intervals(self) -> int:
+        """The number of intervals."""
+        return len(self.shares) - 1
+
+    @property
+    def timed(self) -> bool:
+        """Whether times are variables."""
+        return self.moving or self.duration[0] < self.duration[1]
+
+
+class Effort(NamedTuple):
+    """The sum of the squares of the controls with these `names`."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, at: Reading) -> Any:
+        return sum(jnp.sum(jnp.square(at[name])) for name in self.names)
+
+
+def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> tuple[Any, Any]:
+    """The controls by name, and their bounds.
+
+    **Raises:** `ValueError` for a name that is no parameter or cannot be an input, for reversed bounds, and for a
+    control of a joint's motion that is not smooth.
+    """
+    if interpolation not in COURSES:
+        raise ValueError(f"plan: interpolation must be 'held', 'linear' or 'cubic', got {interpolation!r}.")
+    if not isinstance(given, Mapping) or not given:
+        raise ValueError(
+            f"plan: controls must be bounds by the names of parameters, {{'motor.force': (-2.0, 2.0)}}; got {given!r}."
+        )
+    course, existing = COURSES[interpolation], parameters(system)
+    controls, bounds = [], []
+    for name, pair in given.items():
+        if name not in existing:
+            raise unknown("control", name, existing, "plan")
+        value = existing[name]
+        numbers = jnp.zeros((course.local, *value.shape), value.dtype)
+        driven = with_inputs(system, {name: Piece(course.powers(numbers, 1.0), 0.0, 1.0, True)})
+        if driven.parameter_table.signals[name][1] and not course.smooth:
+            raise ValueError(
+                f"plan: constraints depend on the control {name!r}, whose rate must not jump: take "
+                "interpolation='cubic'."
+            )
+        pair = (None, None) if pair is None else pair
+        bounds.append(bounds_of(f"plan: the bounds of control {name!r}", pair, value.shape))
+        controls.append(Control(name, value.shape, course))
+    return tuple(controls), tuple(bounds)
+
+
+def checked_design(system: AbstractSystem, given: Any, controls: tuple[Control, ...]) -> tuple[Any, Any]:
+    """The designed parameters' names and shapes, and their bounds."""
+    existing, shapes, bounds = parameters(system), [], []
+    for name, pair in (given or {}).items():
+        if name not in existing:
+            raise unknown("parameter", name, existing, "plan: design")
+        if name in (control.name for control in controls):
+            raise ValueError(f"plan: {name!r} is a control and a designed parameter; take one of them.")
+        low, high = bounds_of(f"plan: the bounds of {name!r}", pair, existing[name].shape)
+        value = np.asarray(existing[name])
+        if np.any(value < low) or np.any(value > high):
+            raise ValueError(f"plan: {name!r} is {value} in the system, not within its bounds {pair}.")
+        shapes.append((name, existing[name].shape))
+        bounds.append((low, high))
+    return tuple(shapes), tuple(bounds)
+
+
+def checked_limits(system: AbstractSystem, where: str, given: Any, others: Mapping[str, Any]) -> Limits:
+    """Limits of quantities by name, `(low, high)`, or a number that they equal.
+
+    **Arguments:** `others`: the shapes of controls and designed parameters by name.
+    """
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(f"plan: {where} must be a state, or values or bounds by name; got {given!r}.")
+    components, lows, highs = [], [], []
+    for name, value in (given or {}).items():
+        shape = _shape(system, name, others, where)
+        pair = value if isinstance(value, tuple) and len(value) == 2 and shape != (2,) else (value, value)
+        if isinstance(value, tuple) and len(value) == 2 and shape == (2,) and any(np.ndim(x) or x is None for x in value):
+            pair = value
+        low, high = bounds_of(f"plan: {where} of {name!r}", pair, shape, equal=True)
+        components += component_names(name, shape)
+        lows.append(low.reshape(-1))
+        highs.append(high.reshape(-1))
+    flat = lambda parts: np.concatenate([np.zeros(0), *parts])
+    return Limits(tuple(given or {}), tuple(components), flat(lows), flat(highs))
+
+
+def _shape(system, name, others, where):
+    state = State(*(jnp.zeros(n) for n in (system.nq, system.nu)), jnp.zeros(system.nz) if system.nz else None)
+    reading = Reading(system, state, 0.0, dict(others))
+    if name not in reading.names:
+        raise unknown("quantity", name, reading.names, f"plan: {where}")
+    if name in others:
+        return np.shape(others[name])
+    return jax.eval_shape(lambda y: Reading(system, y, 0.0)[name], state).shape
+
+
+def checked_duration(given: Any) -> tuple[float, float]:
+    """The bounds of the duration [s], equal for a number."""
+    pair = given if isinstance(given, tuple) else (given, given)
+    low, high = (float(x) for x in bounds_of("plan: duration", pair, (), equal=True))
+    if not (low > 0 and np.isfinite(high)):
+        raise ValueError(f"plan: duration must be a positive number of seconds, or two of them (low, high); got {given!r}.")
+    return low, high
+
+
+def checked_shares(intervals: Any) -> np.ndarray:
+    """The nodes as shares of the duration, from the number of intervals or from ascending shares."""
+    if np.ndim(intervals) == 0:
+        return np.linspace(0.0, 1.0, whole_number("plan: intervals", intervals, 1, ", or ascending shares from 0 to 1") + 1)
+    shares = np.asarray(real_array("plan: intervals", intervals, float, None))
+    if shares.ndim != 1 or shares.size < 2 or shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
+        raise ValueError(f"plan: intervals must be a number, or ascending shares from 0 to 1; got {intervals!r}.")
+    return shares

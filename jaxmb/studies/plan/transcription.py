@@ -1,0 +1,337 @@
+"""A plan as a nonlinear program: multiple shooting in the charts of its nodes.
+
+The variables are the coordinates of each node in its chart, the numbers of the controls, the designed parameters, and
+the times. Equations join the end of each interval to the next node.
+
+Source: H. G. Bock and K. J. Plitt, "A Multiple Shooting Algorithm for Direct Solution of Optimal Control Problems",
+IFAC Proceedings Volumes 17(2), 1984.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+
+from ..._types import State
+from ...linalg.jitted import jitted
+from ...manifold import Chart
+from ...system import AbstractSystem
+from .guess import Guess
+from .lanes import AbstractLane, Arrival, Block, Look, Model
+from .problem import Problem, Term
+from .task import Limits, Task
+
+# Bounds of the lengths of moving intervals, relative to the guess.
+_SHORTEST, _LONGEST = 0.05, 5.0
+
+
+class Nodes(NamedTuple):
+    """The charts at the nodes, without their system: fields of `Chart` stacked along axis 0; the coordinates there, and
+    typical changes of them.
+    """
+
+    charts: Any
+    coordinates: np.ndarray
+    scales: np.ndarray
+
+
+@jitted
+def _charts(system, ts, states, duration):
+    scales = jnp.concatenate(
+        [system.coordinate_scale(), system.velocity_scale() * (3.0 / duration), jnp.ones(system.nz)]
+    )
+
+    def of_one(t, state):
+        chart = Chart.at(system, t, state)
+        fields = chart.origin, chart.indices, chart.split, chart.fresh
+        return fields, chart.coordinates(chart.origin), scales[chart.indices]
+
+    return jax.vmap(of_one)(ts, states)
+
+
+def nodes_at(system: AbstractSystem, ts: np.ndarray, states: State) -> Nodes:
+    """Charts at states."""
+    charts, coordinates, scales = _charts(system, jnp.asarray(ts), states, float(ts[-1] - ts[0]))
+    return Nodes(jax.tree.map(np.asarray, charts), np.asarray(coordinates), np.asarray(scales))
+
+
+class _Entries:
+    """Entries of a sparse matrix, added in blocks."""
+
+    def __init__(self):
+        self.parts: list[Any] = []
+
+    def add(self, rows: Any, columns: Any, values: Any = 1.0) -> None:
+        rows, columns, values = np.broadcast_arrays(rows, columns, np.asarray(values, float))
+        self.parts.append((rows.reshape(-1), columns.reshape(-1), values.reshape(-1)))
+
+    def matrix(self, shape: tuple[int, int]) -> sparse.csr_array:
+        rows, columns, values = (np.concatenate([np.zeros(0, kind), *(p[k] for p in self.parts)]) for k, kind in enumerate((int, int, float)))
+        return sparse.csr_array((values, (rows, columns)), shape=shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """The places of variables: `x`, shape (nodes, coordinates); `times`: the duration, or the intervals' lengths, or
+    nothing; `controls`, one array of shape (numbers, components) for each; `design`.
+    """
+
+    x: np.ndarray
+    times: np.ndarray
+    controls: tuple[np.ndarray, ...]
+    design: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """The number of variables."""
+        return self.x.size + self.times.size + sum(c.size for c in self.controls) + self.design.size
+
+
+def _places(task: Task, coordinates: int) -> Places:
+    counter = iter(range(10**9))
+    some = lambda *shape: np.array([next(counter) for _ in range(int(np.prod(shape)))], int).reshape(shape)
+    x = some(task.intervals + 1, coordinates)
+    times = some(task.intervals if task.moving else int(task.timed))
+    controls = tuple(some(c.course.count(task.intervals), c.size) for c in task.controls)
+    return Places(x, times, controls, some(sum(int(np.prod(shape, dtype=int)) for _, shape in task.design)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Transcription:
+    """A task as a program near a guess.
+
+    **Fields:** the `task`; the `nodes`, charts at the guess; `places` of the variables; the `problem`, and its `start`;
+    `gaps`: rows that join intervals; `rows_of`: rows of `"start"`, `"end"`, `"path"` and `"duration"`.
+    """
+
+    task: Task
+    nodes: Nodes
+    places: Places
+    problem: Problem
+    start: np.ndarray
+    gaps: np.ndarray
+    rows_of: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, task: Task, guess: Guess, steps: int, control_scales: Sequence[np.ndarray] | None = None) -> "Transcription":
+        model = Model(task.system, task.controls, task.design)
+        nodes = nodes_at(model.designed(jnp.asarray(guess.design)), guess.ts, guess.states)
+        return _Transcriber(task, guess, nodes, model).transcribed(steps, control_scales)
+
+    def names_at(self, node: int) -> tuple[str, ...]:
+        """The names of a node's coordinates and rates."""
+        chart = Chart(self.task.system, *jax.tree.map(lambda x: x[node], self.nodes.charts))
+        return chart.names
+
+    def read(self, z: np.ndarray) -> Guess:
+        """The states, times, controls and parameters of the variables."""
+        task, places = self.task, self.places
+        design = z[places.design]
+        ts = _times(task, z, places)
+        system = Model(task.system, task.controls, task.design).designed(jnp.asarray(design))
+        states = _states(system, self.nodes.charts, ts, z[places.x])
+        return Guess(states, ts, tuple(z[c] for c in places.controls), design)
+
+
+@jitted
+def _states(system, charts, ts, coordinates):
+    return jax.vmap(lambda chart, t, x: Chart(system, *chart).state(t, x))(charts, ts, coordinates)
+
+
+def _times(task: Task, z: np.ndarray, places: Places) -> np.ndarray:
+    if task.moving:
+        return task.t0 + np.append(0.0, np.cumsum(z[places.times]))
+    return task.t0 + task.shares * (z[places.times[0]] if task.timed else task.duration[0])
+
+
+class _Transcriber:
+    """Makes a `Transcription`."""
+
+    def __init__(self, task: Task, guess: Guess, nodes: Nodes, model: Model):
+        self.task, self.guess, self.nodes, self.model = task, guess, nodes, model
+        self.places = _places(task, nodes.coordinates.shape[1])
+        self.terms: list[Term] = []
+        self.of_outputs, self.of_variables = _Entries(), _Entries()
+        self.low, self.high, self.names = [np.zeros(0)], [np.zeros(0)], []
+        self.outputs, self.rows_of = 0, {}
+
+    def transcribed(self, steps: int, control_scales: Any) -> Transcription:
+        task, places, nodes = self.task, self.places, self.nodes
+        start, scale, low, high = self._variables(control_scales)
+        gaps = self._join(self._arrival(steps))
+        ends = {"start": (task.start, [0]), "end": (task.end, [task.intervals])}
+        for where, (limits, at) in ends.items():
+            if isinstance(limits, Limits) and limits.names:
+                self._limit(where, limits, at)
+        if task.path.names:
+            self._limit("path", task.path, list(range(task.intervals + 1)))
+        if task.final is not None:
+            first = self._look(task.final, [task.intervals], 1)
+            self.of_outputs.add(0, first)
+        if task.of_time and task.timed:
+            self.of_variables.add(0, places.times, task.of_time)
+        if task.moving:
+            row = self._rows("duration", ["duration"], [task.duration[0]], [task.duration[1]])
+            self.of_variables.add(row, places.times)
+        if task.periodic:
+            self._close()
+        shape = 1 + sum(x.size for x in self.low), self.outputs
+        problem = Problem(
+            scale=scale,
+            low=low,
+            high=high,
+            terms=self.terms,
+            of_outputs=self.of_outputs.matrix(shape),
+            of_variables=self.of_variables.matrix((shape[0], places.size)),
+            row_low=np.concatenate(self.low),
+            row_high=np.concatenate(self.high),
+            names=self.names,
+        )
+        return Transcription(task, nodes, places, problem, start, gaps, self.rows_of)
+
+    def _variables(self, control_scales):
+        task, guess, nodes, places = self.task, self.guess, self.nodes, self.places
+        start, scale = np.zeros(places.size), np.ones(places.size)
+        low, high = np.full(places.size, -np.inf), np.full(places.size, np.inf)
+        start[places.x], scale[places.x] = nodes.coordinates, nodes.scales
+        for end, k in ((task.start, 0), (task.end, -1)):
+            if isinstance(end, State):
+                low[places.x[k]] = high[places.x[k]] = nodes.coordinates[k]
+        lengths = np.diff(guess.ts)
+        if task.moving:
+            start[places.times], scale[places.times] = lengths, lengths
+            low[places.times], high[places.times] = _SHORTEST * lengths, _LONGEST * lengths
+        elif task.timed:
+            start[places.times] = scale[places.times] = guess.ts[-1] - guess.ts[0]
+            low[places.times], high[places.times] = task.duration
+        for number, (control, where) in enumerate(zip(task.controls, places.controls, strict=True)):
+            ends = [np.ravel(side) for side in task.control_bounds[number]]
+            start[where] = guess.controls[number]
+            count = control.course.count(task.intervals)
+            values = where[: task.intervals + 1] if control.course.smooth else where
+            low[values], high[values] = ends
+            bounded = np.isfinite(ends[0]) & np.isfinite(ends[1])
+            usual = np.ones(control.size) if control_scales is None else control_scales[number]
+            scale[where] = np.where(bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual)
+            scale[where[task.intervals + 1 : count]] *= 1.0 / lengths.mean()
+        k = 0
+        for (_, shape), bounds in zip(task.design, task.design_bounds, strict=True):
+            where = places.design[k : k + int(np.prod(shape, dtype=int))]
+            k += where.size
+            low[where], high[where] = (np.ravel(side) for side in bounds)
+            values = guess.design[k - where.size : k]
+            width = np.where(np.isfinite(high[where] - low[where]), high[where] - low[where], np.maximum(np.abs(values), 1e-3))
+            scale[where], start[where] = width, values
+        return start, scale, low, high
+
+    def _arrival(self, steps: int) -> int:
+        """Add the intervals; the place of their first output."""
+        task, places, n = self.task, self.places, self.places.x.shape[1]
+        intervals = np.arange(task.intervals)
+        sizes = [n, 2, *(c.size * c.course.local for c in task.controls), places.design.size]
+        begins = np.cumsum([0, *sizes])
+        width = int(begins[-1])
+        entries, offset = _Entries(), np.zeros((task.intervals, width))
+        at = lambda begin, count: intervals[:, None] * width + begin + np.arange(count)
+        entries.add(at(0, n), places.x[:-1])
+        self._add_times(entries, offset, at(n, 2), n)
+        for control, where, begin in zip(task.controls, places.controls, begins[2:], strict=False):
+            local = where[control.course.places(task.intervals)].reshape(task.intervals, -1)
+            entries.add(at(begin, local.shape[1]), local)
+        entries.add(at(begins[-2], places.design.size), places.design)
+        outputs = self.nodes.charts[0].q.shape[1] + self.nodes.charts[0].u.shape[1] + (task.system.nz or 0) + 1
+        charts = jax.tree.map(lambda x: x[:-1], self.nodes.charts)
+        inputs = entries.matrix((task.intervals * width, places.size))
+        return self._term(Arrival(self.model, task.running), charts, inputs, offset, outputs, steps)
+
+    def _add_times(self, entries, offset, at, n):
+        task, places = self.task, self.places
+        if task.moving:
+            k, j = np.tril_indices(task.intervals, -1)
+            entries.add(at[k, 0], places.times[j])
+            entries.add(at[:, 1], places.times)
+            offset[:, n] = task.t0
+        elif task.timed:
+            entries.add(at[:, 0], places.times, task.shares[:-1])
+            entries.add(at[:, 1], places.times, np.diff(task.shares))
+            offset[:, n] = task.t0
+        else:
+            offset[:, n] = task.t0 + task.duration[0] * task.shares[:-1]
+            offset[:, n + 1] = task.duration[0] * np.diff(task.shares)
+
+    def _look(self, function: Any, at: list[int], outputs: int) -> int:
+        """Add nodes at which a function of the instant is computed; the place of their first output."""
+        task, places, n = self.task, self.places, self.places.x.shape[1]
+        nodes = np.array(at)
+        width = n + 1 + sum(c.size for c in task.controls) + places.design.size
+        entries, offset = _Entries(), np.zeros((nodes.size, width))
+        rows = np.arange(nodes.size)[:, None] * width
+        entries.add(rows + np.arange(n), places.x[nodes])
+        if task.moving:
+            for k, node in enumerate(nodes):
+                entries.add(k * width + n, places.times[:node])
+        elif task.timed:
+            entries.add(rows[:, 0] + n, places.times, task.shares[nodes])
+        offset[:, n] = task.t0 + (0.0 if task.timed else task.duration[0]) * task.shares[nodes]
+        begin = n + 1
+        for control, where in zip(task.controls, places.controls, strict=True):
+            values = where[control.course.values(task.intervals)[nodes]]
+            entries.add(rows + begin + np.arange(control.size), values)
+            begin += control.size
+        entries.add(rows + begin + np.arange(places.design.size), places.design)
+        charts = jax.tree.map(lambda x: x[nodes], self.nodes.charts)
+        inputs = entries.matrix((nodes.size * width, places.size))
+        return self._term(Look(self.model, function), charts, inputs, offset, outputs, 1)
+
+    def _term(self, lane: AbstractLane, charts, inputs, offset, outputs, steps) -> int:
+        lanes = len(charts[1])
+        used = np.flatnonzero(np.any(np.diff(inputs.indptr).reshape(lanes, -1) > 0, axis=0))
+        block = Block(lane, charts, tuple(used.tolist()), steps)
+        self.terms.append(Term(block, inputs, offset.reshape(-1), outputs))
+        first, self.outputs = self.outputs, self.outputs + lanes * outputs
+        return first
+
+    def _rows(self, where: str, names: Sequence[str], low: Any, high: Any) -> np.ndarray:
+        """Add rows with bounds; their numbers, the objective's being zero."""
+        first = 1 + sum(x.size for x in self.low)
+        self.low.append(np.asarray(low, float))
+        self.high.append(np.asarray(high, float))
+        self.names += names
+        rows = first + np.arange(len(names))
+        self.rows_of[where] = rows
+        return rows
+
+    def _join(self, first: int) -> np.ndarray:
+        task, places, nodes = self.task, self.places, self.nodes
+        outputs, indices = self.terms[0].outputs, nodes.charts[1][1:]
+        scales = nodes.scales[1:].reshape(-1)
+        names = [f"node {k + 1}" for k in range(task.intervals) for _ in range(indices.shape[1])]
+        rows = self._rows("gaps", names, np.zeros(scales.size), np.zeros(scales.size))
+        arrived = first + np.arange(task.intervals)[:, None] * outputs + indices
+        self.of_outputs.add(rows, arrived.reshape(-1), 1.0 / scales)
+        self.of_variables.add(rows, places.x[1:].reshape(-1), -1.0 / scales)
+        if task.running is not None:
+            self.of_outputs.add(0, first + np.arange(1, task.intervals + 1) * outputs - 1)
+        return rows
+
+    def _limit(self, where: str, limits: Limits, at: list[int]) -> None:
+        count = len(limits.components)
+        first = self._look(limits, at, count)
+        names = [f"{name} at node {k}" for k in at for name in limits.components]
+        sizes = np.tile(limits.sizes, len(at))
+        rows = self._rows(where, names, np.tile(limits.low, len(at)) / sizes, np.tile(limits.high, len(at)) / sizes)
+        self.of_outputs.add(rows, first + np.arange(len(at) * count), 1.0 / sizes)
+
+    def _close(self) -> None:
+        """The last node is the first node, up to turns of angles."""
+        places, nodes = self.places, self.nodes
+        scales, shift = nodes.scales[0], nodes.coordinates[-1] - nodes.coordinates[0]
+        shift = np.where(np.abs(shift) > np.pi, 2 * np.pi * np.round(shift / (2 * np.pi)), 0.0)
+        rows = self._rows("period", ["period"] * scales.size, shift / scales, shift / scales)
+        self.of_variables.add(rows, places.x[-1], 1.0 / scales)
+        self.of_variables.add(rows, places.x[0], -1.0 / scales)
