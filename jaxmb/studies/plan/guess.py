@@ -1,7 +1,6 @@
 """First states of a plan: straight in coordinates from the start to the end, on the constraints; or along a motion."""
 
-import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +16,12 @@ from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
 from ...trajectory import Trajectory
 from ..evaluate import evaluate
+from .lanes import in_lanes
 from .task import Limits, Task
+
+
+# The largest number of intervals between states that are assembled, and corrections of states between them.
+_KNOTS, _CORRECTIONS = 12, 4
 
 
 class Guess(NamedTuple):
@@ -82,120 +86,117 @@ def _controls(task, named, motion, ts):
 
 
 def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray) -> State:
-    start = _end_state(system, task.start, None, ts[0], "start")
-    coordinates = {name: value for name, value in named.items()}
-    for name in coordinates:
-        if name not in _assembled(system):
-            raise unknown("coordinate", name, _assembled(system), "plan: guess")
-    values = {name: np.stack([np.asarray(value(t) if callable(value) else value) for t in ts]) for name, value in coordinates.items()}
-    fixed = _coordinates(system, task.end) if isinstance(task.end, Limits) else {}
-    if not values and fixed:
-        if start is None:
-            start = system_state(system)
-        names = list(fixed)
-        begin = evaluate(system, start, names, t=ts[0])
-        values = {name: np.asarray(begin[name]) + np.multiply.outer(task.shares, fixed[name] - np.asarray(begin[name])) for name in names}
-    last = task.end if isinstance(task.end, State) else None
-    states, state = [], start if start is not None else (last if last is not None else system_state(system))
-    for k, t in enumerate(ts):
-        if last is not None and not values:
-            share = 1.0 / max(len(ts) - k, 1)
-            state = State(state.q + share * (last.q - state.q), jnp.zeros_like(state.u), state.z)
-        if k == 0 and start is not None:
-            state = start
-        else:
-            fix = {name: value[k] for name, value in values.items()}
-            try:
-                state = assemble(system, State(state.q, jnp.zeros_like(state.u), state.z), fix=fix or None, t=t)
-            except ValueError as error:
-                where = "; ".join(f"{name} = {np.asarray(value):.6g}" if np.ndim(value) == 0 else name for name, value in fix.items())
-                raise ValueError(f"plan: no configuration for the guess at node {k}{' with ' + where if where else ''}: {error}") from None
-        states.append(state)
-    return _with_rates(system, states, ts, start, last)
+    """Coordinates by name along the way, or straight from the start to the end; on the constraints at some times, one
+    after the other, and between them nearly straight.
+    """
+    known = (*system.coordinate_names(), *system.joint_coordinates())
+    for name in named:
+        if name not in known:
+            raise unknown("coordinate", name, known, "plan: guess")
+    start, end = (_end(system, given, t, where) for given, t, where in ((task.start, ts[0], "start"), (task.end, ts[-1], "end")))
+    state = start or (task.end if isinstance(task.end, State) else assemble(system, t=ts[0]))
+    shares = task.shares[np.unique(np.linspace(0, task.intervals, min(task.intervals, _KNOTS) + 1).round().astype(int))]
+    times = ts[0] + (ts[-1] - ts[0]) * shares
+    fixed = {name: [value(t) if callable(value) else value for t in times] for name, value in named.items()}
+    if not named and isinstance(task.end, Limits) and (there := _given(task.end, known)):
+        here = evaluate(system, state, list(there), t=ts[0])
+        fixed = {name: [(1 - share) * np.asarray(here[name]) + share * value for share in shares] for name, value in there.items()}
+    towards = task.end if isinstance(task.end, State) and not named else None
+    states = []
+    for k, t in enumerate(times):
+        if towards is not None:
+            share = 1.0 / max(len(times) - k, 1)
+            state = State(state.q + share * (towards.q - state.q), jnp.zeros_like(state.u), state.z)
+        fix = {name: values[k] for name, values in fixed.items()}
+        state = State(state.q, jnp.zeros_like(state.u), state.z)
+        if k or start is None:
+            state = _assembled(system, state, fix, t, f"the guess at t = {t:.4g} s")
+        states.append(state if k or start is None else start)
+    several = jax.tree.map(lambda *x: np.stack(x), *(State(s.q, s.u, s.z) for s in states))
+    between = lambda y: np.stack([np.interp(ts, times, column) for column in y.T], axis=1)
+    q, z = between(several.q), None if several.z is None else between(several.z)
+    slopes = np.gradient(q, ts, axis=0)
+    states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
+    return _with_ends(states, start, task.end if isinstance(task.end, State) else end)
 
 
-def system_state(system: AbstractSystem) -> State:
-    """The state at the poses given with the bodies, on the constraints."""
-    return assemble(system)
-
-
-def _end_state(system: AbstractSystem, end: State | Limits, guess: State | None, t: Scalar, where: str) -> State | None:
-    """A state at an end, None if nothing of it is given."""
-    if isinstance(end, State):
-        return end
-    fixed = _coordinates(system, end)
-    rates = {name: value for name, value in _middles(end).items() if name in _rates(system)}
-    if not fixed and not rates:
-        return None
+def _assembled(system: AbstractSystem, state: State | None, fix: Mapping[str, Any], t: Scalar, where: str, **rates: Any) -> State:
     try:
-        return assemble(system, guess, fix=fixed or None, rates=rates or None, t=t)
+        return assemble(system, state, fix=dict(fix) or None, t=t, **rates)
     except ValueError as error:
-        raise ValueError(f"plan: the {where} contradicts the constraints or the reach: {error}") from None
+        given = ", ".join(f"{name} = {np.array2string(np.asarray(value), precision=4)}" for name, value in fix.items())
+        raise ValueError(f"plan: {where} contradicts the constraints{f', with {given}' if given else ''}: {error}") from None
 
 
-def _coordinates(system, limits):
-    return {name: value for name, value in _middles(limits).items() if name in _assembled(system)}
+def _end(system: AbstractSystem, given: State | Limits, t: Scalar, where: str) -> State | None:
+    """A state with the coordinates and rates that are given at an end, None if none is."""
+    if isinstance(given, State):
+        return given
+    coordinates = _given(given, (*system.coordinate_names(), *system.joint_coordinates()))
+    rates = _given(given, (*system.rate_names(), *(f"{name}_rate" for name in system.joint_coordinates())))
+    if where == "end" or not (coordinates or rates):
+        return None
+    return _assembled(system, None, coordinates, t, f"the {where}", rates=rates or None)
 
 
-def _middles(limits: Limits) -> dict[str, np.ndarray]:
-    """Values between the limits, of quantities with two of them."""
-    middle, out, k = 0.5 * (limits.low + limits.high), {}, 0
-    for name in limits.names:
-        own = [j for j, component in enumerate(limits.components) if component == name or component.startswith(f"{name}[")]
-        if np.all(np.isfinite(middle[own])):
-            out[name] = middle[own] if len(own) > 1 else middle[own[0]]
+def _given(limits: Limits, known: Iterable[str]) -> dict[str, np.ndarray]:
+    """The values, or the middles between the bounds, of quantities with known names."""
+    middle, out, begin = 0.5 * (limits.low + limits.high), {}, 0
+    for name, shape in zip(limits.names, limits.shapes, strict=True):
+        own = middle[begin : begin + int(np.prod(shape, dtype=int))].reshape(shape)
+        begin += own.size
+        if name in known and np.all(np.isfinite(own)):
+            out[name] = own
     return out
 
 
-def _assembled(system: AbstractSystem) -> tuple[str, ...]:
-    return (*system.coordinate_names(), *system.joint_coordinates())
-
-
-def _rates(system: AbstractSystem) -> tuple[str, ...]:
-    return (*system.rate_names(), *(f"{name}_rate" for name in system.joint_coordinates()))
-
-
-def _with_rates(system: AbstractSystem, states: list[State], ts: np.ndarray, start: State | None, end: State | None) -> State:
-    """The states with velocities by differences; those of given ends stay."""
-    together = jax.tree.map(lambda *x: jnp.stack(x), *(State(s.q, s.u, s.z) for s in states))
-    slopes = np.gradient(np.asarray(together.q), ts, axis=0)
-    u = np.array(_velocities(system, jnp.asarray(ts), together, jnp.asarray(slopes)))
+def _with_ends(states: State, start: State | None, end: State | None) -> State:
+    """The states with other first and last states."""
     for k, given in ((0, start), (-1, end)):
         if given is not None:
-            u[k] = np.asarray(given.u)
-    return State(together.q, jnp.asarray(u), together.z)
+            states = jax.tree.map(lambda y, x, k=k: _replaced(y, k, x), states, State(given.q, given.u, given.z))
+    return states
 
 
-@functools.partial(jitted)
-def _velocities(system, ts, states, slopes):
-    """The velocities on the constraints whose rates of coordinates are nearest to some slopes."""
+def _replaced(values: np.ndarray, k: int, value: Any) -> np.ndarray:
+    values[k] = value
+    return values
+
+
+@jitted
+def _on_constraints(system, ts, states, slopes):
+    """The nearest states on the constraints, with velocities for which coordinates have nearly these slopes."""
 
     def of_one(t, state, slope):
         at = Instant.of(system, t, state)
+        for _ in range(_CORRECTIONS if system.position_rows else 0):
+            at = at.with_(q=at.q - jnp.linalg.pinv(at.coordinate_jacobian) @ at.coordinate_residual)
         of_velocities = jax.jacfwd(lambda u: at.with_(u=u).rates)(jnp.zeros_like(at.u))
-        u = jnp.linalg.lstsq(of_velocities, slope)[0]
-        here = at.with_(u=u)
-        rows = here.jacobian[: system.velocity_rows]
-        return u - (jnp.linalg.pinv(rows) @ here.velocity_residual if system.velocity_rows else 0.0)
+        here = at.with_(u=jnp.linalg.lstsq(of_velocities, slope)[0])
+        if system.velocity_rows:
+            rows = here.jacobian[: system.velocity_rows]
+            here = here.with_(u=here.u - jnp.linalg.pinv(rows) @ here.velocity_residual)
+        return here.state
 
     return jax.vmap(of_one)(ts, states, slopes)
 
 
 def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> State:
     """States along a motion or another plan, its time stretched to the duration."""
-    given: Any = motion if not isinstance(motion, Trajectory) else motion.ys
-    ys = given.states if hasattr(given, "states") else given
-    times = np.asarray(motion.ts)
+    ys, times = (motion.ys if isinstance(motion, Trajectory) else motion.states), np.asarray(motion.ts)
     if times.ndim != 1 or times.size < 2:
         raise ValueError("plan: a motion as the guess needs at least two saved times: simulate(…, saveat=times).")
+    if np.shape(ys.q)[1:] != (system.nq,):
+        raise ValueError(f"plan: the guess is a motion of another system, with {np.shape(ys.q)[1]} coordinates instead of {system.nq}.")
     places = times[0] + (times[-1] - times[0]) * task.shares
     between = lambda y: np.stack([np.interp(places, times, column) for column in np.asarray(y).T], axis=1)
-    q, u = between(ys.q), between(ys.u)
-    z = None if ys.z is None else jnp.asarray(between(ys.z))
-    # Another duration has other velocities.
-    u = u * (times[-1] - times[0]) / (ts[-1] - ts[0])
-    states = []
-    for k, t in enumerate(ts):
-        state = State(jnp.asarray(q[k]), jnp.asarray(u[k]), None if z is None else z[k])
-        states.append(assemble(system, state, t=t))
-    return jax.tree.map(lambda *x: jnp.stack(x), *(State(s.q, s.u, s.z) for s in states))
+    q, z = between(ys.q), None if ys.z is None else between(ys.z)
+    # Another duration has other rates.
+    slopes = between(in_lanes(_rates, system, times, State(ys.q, ys.u, ys.z))) * (times[-1] - times[0]) / (ts[-1] - ts[0])
+    states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
+    return _with_ends(states, *(x if isinstance(x, State) else None for x in (task.start, task.end)))
+
+
+@jitted
+def _rates(system, ts, states):
+    return jax.vmap(lambda t, state: Instant.of(system, t, state).rates)(ts, states)

@@ -1,7 +1,6 @@
 """Intervals and nodes of a plan, computed side by side: values, first and second derivatives by their inputs."""
 
 import abc
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -162,9 +161,10 @@ class Look(AbstractLane):
         return jnp.concatenate([jnp.ravel(jnp.asarray(number, x.dtype)) for number in jax.tree.leaves(numbers)])
 
 
-@functools.partial(jitted)
-def _linearised(lane, charts, inputs, steps, active):
+@jitted
+def _linearised(shared, charts, inputs):
     """The outputs of lanes, and their derivatives by the active inputs."""
+    lane, steps, active = shared
 
     def of_one(chart, whole):
         def outputs(part):
@@ -175,6 +175,14 @@ def _linearised(lane, charts, inputs, steps, active):
         return y, jacobian
 
     return jax.vmap(of_one)(charts, inputs)
+
+
+def in_lanes(program: Callable[..., Any], shared: Any, *members: Any) -> Any:
+    """`program(shared, *members)` of members along axis 0, so many at a time that one program serves any number."""
+    count = len(jax.tree.leaves(members)[0])
+    order = np.minimum(np.arange(-(-count // _TOGETHER) * _TOGETHER), count - 1).reshape(-1, _TOGETHER)
+    blocks = [program(shared, *jax.tree.map(lambda x, these=these: np.asarray(x)[these], members)) for these in order]
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[:count], *blocks)
 
 
 class Block:
@@ -192,37 +200,23 @@ class Block:
 
         **Arguments:** `steps` of each interval, default the block's.
         """
-        lanes = len(inputs)
-        order = np.arange(-(-lanes // _TOGETHER) * _TOGETHER)
-        return self._computed(inputs, np.minimum(order, lanes - 1), self.steps if steps is None else steps)
-
-    def _computed(self, inputs, charts_of, steps):
-        """As `linearised`, for lanes whose charts have the numbers `charts_of`."""
-        lanes, results = len(inputs), []
-        padded = inputs[np.minimum(np.arange(len(charts_of)), lanes - 1)]
-        for begin in range(0, len(charts_of), _TOGETHER):
-            these = charts_of[begin : begin + _TOGETHER]
-            charts = jax.tree.map(lambda x, these=these: x[these], self.charts)
-            block = padded[begin : begin + _TOGETHER]
-            results.append(_linearised(self.lane, charts, block, np.asarray(steps), self.active))
-        outputs, jacobians = (np.concatenate([np.asarray(x) for x in parts]) for parts in zip(*results, strict=True))
-        return outputs[:lanes], jacobians[:lanes]
+        lane = self.lane, np.asarray(self.steps if steps is None else steps), self.active
+        return in_lanes(_linearised, lane, self.charts, inputs)
 
     def curvature(
         self, inputs: np.ndarray, first: np.ndarray, weights: np.ndarray, scales: np.ndarray, central: bool = False
     ) -> np.ndarray:
         """The second derivatives of each lane's weighted sum of outputs, by differences of `first`, its derivatives."""
-        lanes, count = len(inputs), len(self.active)
+        lanes, active = len(inputs), np.array(self.active, int)
+        sides = np.array((1.0, -1.0) if central else (1.0,))
         # Inputs of a lane that depend on no variable have no scale.
-        aside = _ASIDE * np.where(scales > 0, scales, 1.0)
-        sides = (1.0, -1.0) if central else (1.0,)
-        moved = np.concatenate([inputs] * (count * len(sides)))
-        for number, (side, k) in enumerate((side, k) for side in sides for k in range(count)):
-            moved[number * lanes : (number + 1) * lanes, self.active[k]] += side * aside[:, self.active[k]]
-        whole = -(-len(moved) // _TOGETHER) * _TOGETHER
-        charts_of = np.minimum(np.arange(whole), len(moved) - 1) % lanes
-        slopes = self._computed(moved, charts_of, self.steps)[1].reshape(len(sides), count, lanes, *first.shape[1:])
-        change = slopes[0] - slopes[1] if central else slopes[0] - first
-        width = (len(sides) * aside[:, list(self.active)]).T
-        second = np.einsum("kloj,lo->lkj", change, weights) / width.T[:, :, None]
+        aside = _ASIDE * np.where(scales > 0, scales, 1.0)[:, active]
+        moved = np.broadcast_to(inputs, (sides.size, active.size, *inputs.shape)).copy()
+        for k, place in enumerate(active):
+            moved[:, k, :, place] += sides[:, None] * aside[:, k]
+        charts = jax.tree.map(lambda x: np.concatenate([x] * (sides.size * active.size)), self.charts)
+        slopes = in_lanes(_linearised, (self.lane, np.asarray(self.steps), self.active), charts, moved.reshape(-1, inputs.shape[1]))[1]
+        slopes = slopes.reshape(sides.size, active.size, *first.shape)
+        change, width = (slopes[0] - slopes[1], 2 * aside) if central else (slopes[0] - first, aside)
+        second = np.einsum("kloj,lo->lkj", change, weights) / width[:, :, None]
         return 0.5 * (second + second.transpose(0, 2, 1))

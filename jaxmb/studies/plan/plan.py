@@ -1,5 +1,6 @@
 """Optimal control: controls, duration and parameters of a motion between two ends that minimise an objective."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from ...system import AbstractSystem
 from ...system.design import Bounds
 from .guess import first_guess
 from .result import Plan
-from .solve import Iteration, solved
+from .solve import Iteration, arcs_of, solved
 from .task import (
     Effort,
     Task,
@@ -83,7 +84,8 @@ def plan(
 
     - `intervals`: their number, or the nodes as ascending shares of the duration from 0 to 1.
     - `interpolation` of controls: `"held"`, constant on each interval; `"linear"`; `"cubic"`, with continuous rates.
-    - `moving`: whether nodes move, to where controls jump: for least time, with `"held"`.
+    - `moving`: whether nodes then move to where controls jump; the others stay evenly between them. For least time,
+        with `"held"`.
     - `guess`: values or functions of time by name, of coordinates, controls, designed parameters and `"duration"`; or a
         `Trajectory`; or another `Plan`. By default coordinates go straight from start to end, and controls have the
         values of the system.
@@ -110,14 +112,18 @@ def plan(
         path=path,
         design=design,
         periodic=periodic,
-        nodes=(intervals, interpolation, moving),
+        nodes=(intervals, interpolation),
         t0=t0,
     )
     whole_number("plan: max_iterations", max_iterations)
     if not tol > 0:
         raise ValueError(f"plan: tol must be positive, got {tol!r}.")
     told = _print if verbose else lambda iteration: None
-    return Plan.of(solved(task, first_guess(task, guess), method, max_iterations, tol, told), method, tol)
+    solution = solved(task, first_guess(task, guess), method, max_iterations, tol, told)
+    if moving and solution.answer.success:
+        arcs = arcs_of(task, solution.found)
+        solution = solved(dataclasses.replace(task, arcs=arcs), solution.found, method, max_iterations, tol, told)
+    return Plan.of(solution, method, tol)
 
 
 def _print(iteration: Iteration) -> None:
@@ -127,7 +133,7 @@ def _print(iteration: Iteration) -> None:
 
 def _task(system, *, controls, duration, ends, objective, path, design, periodic, nodes, t0) -> Task:
     check_kind("plan: system", system, AbstractSystem, "a compiled scene", "use scene.compile()")
-    intervals, interpolation, moving = nodes
+    intervals, interpolation = nodes
     chosen, control_bounds = checked_controls(system, controls, interpolation)
     shapes, design_bounds = checked_design(system, design, chosen)
     others = {control.name: jnp.zeros(control.shape) for control in chosen}
@@ -141,6 +147,7 @@ def _task(system, *, controls, duration, ends, objective, path, design, periodic
         raise ValueError(f"plan: there is nothing to minimise; give {_OBJECTIVES}.")
     if any(not (given is None or given == word or callable(given)) for given, word in ((running, "effort"), (final, "time"))):
         raise ValueError(f"plan: give {_OBJECTIVES}; got {running!r} and {final!r}.")
+    shares = checked_shares(intervals)
     return Task(
         system=system,
         controls=chosen,
@@ -149,8 +156,8 @@ def _task(system, *, controls, duration, ends, objective, path, design, periodic
         design_bounds=design_bounds,
         t0=float(real_array("plan: t0", t0, float)),
         duration=checked_duration(duration),
-        shares=checked_shares(intervals),
-        moving=bool(moving),
+        shares=shares,
+        arcs=(0, len(shares) - 1),
         start=start,
         end=end,
         path=checked_limits(system, "path", path, others),

@@ -11,7 +11,7 @@ import numpy as np
 from ...linalg.jitted import jitted
 from ...manifold import Chart
 from .guess import Guess
-from .lanes import Model
+from .lanes import Model, in_lanes
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
 from .task import Task
@@ -19,6 +19,8 @@ from .transcription import Transcription
 
 # The most rounds; the most steps of an interval; charts beyond this quality are replaced.
 _ROUNDS, _MOST_STEPS, _WORN = 8, 512, 2.0
+# Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
+_SMALL_JUMP, _SWITCH = 0.02, 0.4
 
 
 class Iteration(NamedTuple):
@@ -45,7 +47,9 @@ class Solution:
     error: float
 
 
-def solved(task: Task, guess: Guess, method: str | None, limit: int, tol: float, told: Callable[[Iteration], None]) -> Solution:
+def solved(
+    task: Task, guess: Guess, method: str | None, limit: int, tol: float, told: Callable[[Iteration], None]
+) -> Solution:
     """The optimum near a guess.
 
     **Raises:** `ValueError` if a segment fails with the guess, or if conditions depend on each other.
@@ -77,6 +81,25 @@ def solved(task: Task, guess: Guess, method: str | None, limit: int, tol: float,
         if is_last or (steps == before and worn <= _WORN):
             return Solution(transcription, answer, guess, tuple(log), error)
     raise AssertionError
+
+
+def arcs_of(task: Task, found: Guess) -> tuple[int, ...]:
+    """The first and the last node, and between them the nodes where a held control switches: its jumps at neighbouring
+    nodes add up to a large part of its range.
+    """
+    switches = set()
+    for numbers in found.controls:
+        for values in numbers.T:
+            jumps = np.diff(values) / max(float(np.ptp(values)), 1e-300)
+            cluster: list[int] = []
+            for k, jump in enumerate([*jumps, 0.0]):
+                if abs(jump) > _SMALL_JUMP and (not cluster or np.sign(jump) == np.sign(jumps[cluster[0]])):
+                    cluster.append(k)
+                elif cluster:
+                    if abs(sum(jumps[cluster])) > _SWITCH:
+                        switches.add(1 + max(cluster, key=lambda j: abs(jumps[j])))
+                    cluster = [k] if abs(jump) > _SMALL_JUMP else []
+    return (0, *sorted(switches), task.intervals)
 
 
 def _enough_steps(transcription: Transcription, z: np.ndarray, steps: int, tol: float) -> tuple[int, float]:
@@ -159,5 +182,5 @@ def _quality(transcription: Transcription, z: np.ndarray, guess: Guess) -> float
     """The largest quality of a node's chart; infinite where a state is lost."""
     task = transcription.task
     system = Model(task.system, task.controls, task.design).designed(guess.design)
-    growth = np.asarray(_growth(system, transcription.nodes.charts, guess.ts, z[transcription.places.x]))
+    growth = in_lanes(_growth, system, transcription.nodes.charts, guess.ts, z[transcription.places.x])
     return float(np.max(np.where(np.isfinite(growth), growth, np.inf)))

@@ -20,10 +20,10 @@ from .lanes import Control
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Bounds of quantities by name, component by component: `low` and `high`, equal for equations."""
+    """Bounds of quantities by name, with their `shapes`; `low` and `high` of all components, equal for equations."""
 
     names: tuple[str, ...]
-    components: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
     low: np.ndarray
     high: np.ndarray
 
@@ -39,6 +39,12 @@ class Limits:
         return hash(self.names)
 
     @property
+    def components(self) -> list[str]:
+        """The names of all components."""
+        each = zip(self.names, self.shapes, strict=True)
+        return [component for name, shape in each for component in component_names(name, shape)]
+
+    @property
     def sizes(self) -> np.ndarray:
         """Units of violations: the distance of the bounds, or the larger bound, or 1."""
         ends = np.maximum(*(np.where(np.isfinite(side), np.abs(side), 0.0) for side in (self.low, self.high)))
@@ -52,8 +58,8 @@ class Task:
     """A plan's problem.
 
     **Fields:** the `system`; `controls` with `control_bounds`, one pair for each; `design`: names and shapes, with
-    `design_bounds`; `t0`; `duration`: its bounds; `shares`: the nodes as shares of the duration, 0 to 1, or with
-    `moving` nodes their guess; `start` and `end`: a state, or limits; `path`: limits; `running` and `final`: functions
+    `design_bounds`; `t0`; `duration`: its bounds; `shares`: the nodes as shares of the duration, 0 to 1; `arcs`: the
+    first and the last node, and between them nodes that move, with the others evenly between them; `start` and `end`: a state, or limits; `path`: limits; `running` and `final`: functions
     of the instant, or None; `of_time`: the weight of the duration in the objective; `periodic`.
     """
 
@@ -65,7 +71,7 @@ class Task:
     t0: float
     duration: tuple[float, float]
     shares: np.ndarray
-    moving: bool
+    arcs: tuple[int, ...]
     start: State | Limits
     end: State | Limits
     path: Limits
@@ -80,9 +86,20 @@ class Task:
         return len(self.shares) - 1
 
     @property
+    def moving(self) -> bool:
+        """Whether nodes move."""
+        return len(self.arcs) > 2
+
+    @property
     def timed(self) -> bool:
         """Whether times are variables."""
         return self.moving or self.duration[0] < self.duration[1]
+
+    @property
+    def passed(self) -> np.ndarray:
+        """The part of each arc that has passed at each node, shape (nodes, arcs), 0 to 1."""
+        begins, ends = self.shares[list(self.arcs[:-1])], self.shares[list(self.arcs[1:])]
+        return np.clip((self.shares[:, None] - begins) / (ends - begins), 0.0, 1.0)
 
 
 class Effort(NamedTuple):
@@ -149,18 +166,18 @@ def checked_limits(system: AbstractSystem, where: str, given: Any, others: Mappi
     """
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"plan: {where} must be a state, or values or bounds by name; got {given!r}.")
-    components, lows, highs = [], [], []
+    shapes, lows, highs = [], [], []
     for name, value in (given or {}).items():
         shape = _shape(system, name, others, where)
         pair = value if isinstance(value, tuple) and len(value) == 2 and shape != (2,) else (value, value)
         if isinstance(value, tuple) and len(value) == 2 and shape == (2,) and any(np.ndim(x) or x is None for x in value):
             pair = value
         low, high = bounds_of(f"plan: {where} of {name!r}", pair, shape, equal=True)
-        components += component_names(name, shape)
+        shapes.append(shape)
         lows.append(low.reshape(-1))
         highs.append(high.reshape(-1))
     flat = lambda parts: np.concatenate([np.zeros(0), *parts])
-    return Limits(tuple(given or {}), tuple(components), flat(lows), flat(highs))
+    return Limits(tuple(given or {}), tuple(shapes), flat(lows), flat(highs))
 
 
 def _shape(system, name, others, where):

@@ -22,11 +22,11 @@ from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...system import AbstractSystem
 from .guess import Guess
-from .lanes import AbstractLane, Arrival, Block, Look, Model
+from .lanes import AbstractLane, Arrival, Block, Look, Model, in_lanes
 from .problem import Problem, Term
 from .task import Limits, Task
 
-# Bounds of the lengths of moving intervals, relative to the guess.
+# Bounds of the lengths of moving arcs, relative to the guess.
 _SHORTEST, _LONGEST = 0.05, 5.0
 
 
@@ -41,7 +41,8 @@ class Nodes(NamedTuple):
 
 
 @jitted
-def _charts(system, ts, states, duration):
+def _charts(shared, ts, states):
+    system, duration = shared
     scales = jnp.concatenate(
         [system.coordinate_scale(), system.velocity_scale() * (3.0 / duration), jnp.ones(system.nz)]
     )
@@ -56,8 +57,7 @@ def _charts(system, ts, states, duration):
 
 def nodes_at(system: AbstractSystem, ts: np.ndarray, states: State) -> Nodes:
     """Charts at states."""
-    charts, coordinates, scales = _charts(system, jnp.asarray(ts), states, float(ts[-1] - ts[0]))
-    return Nodes(jax.tree.map(np.asarray, charts), np.asarray(coordinates), np.asarray(scales))
+    return Nodes(*in_lanes(_charts, (system, np.asarray(ts[-1] - ts[0])), ts, states))
 
 
 class _Entries:
@@ -70,6 +70,11 @@ class _Entries:
         rows, columns, values = np.broadcast_arrays(rows, columns, np.asarray(values, float))
         self.parts.append((rows.reshape(-1), columns.reshape(-1), values.reshape(-1)))
 
+    def add_matrix(self, rows: np.ndarray, columns: np.ndarray, matrix: np.ndarray) -> None:
+        """Add the entries of a matrix that are not zero."""
+        i, j = np.nonzero(matrix)
+        self.add(rows[i], columns[j], matrix[i, j])
+
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_array:
         rows, columns, values = (np.concatenate([np.zeros(0, kind), *(p[k] for p in self.parts)]) for k, kind in enumerate((int, int, float)))
         return sparse.csr_array((values, (rows, columns)), shape=shape)
@@ -77,8 +82,7 @@ class _Entries:
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """The places of variables: `x`, shape (nodes, coordinates); `times`: the duration, or the intervals' lengths, or
-    nothing; `controls`, one array of shape (numbers, components) for each; `design`.
+    """The places of variables: `x`, shape (nodes, coordinates); `times`: the lengths of arcs, or nothing; `controls`, one array of shape (numbers, components) for each; `design`.
     """
 
     x: np.ndarray
@@ -96,7 +100,7 @@ def _places(task: Task, coordinates: int) -> Places:
     counter = iter(range(10**9))
     some = lambda *shape: np.array([next(counter) for _ in range(int(np.prod(shape)))], int).reshape(shape)
     x = some(task.intervals + 1, coordinates)
-    times = some(task.intervals if task.moving else int(task.timed))
+    times = some(len(task.arcs) - 1 if task.timed else 0)
     controls = tuple(some(c.course.count(task.intervals), c.size) for c in task.controls)
     return Places(x, times, controls, some(sum(int(np.prod(shape, dtype=int)) for _, shape in task.design)))
 
@@ -134,7 +138,7 @@ class Transcription:
         design = z[places.design]
         ts = _times(task, z, places)
         system = Model(task.system, task.controls, task.design).designed(jnp.asarray(design))
-        states = _states(system, self.nodes.charts, ts, z[places.x])
+        states = in_lanes(_states, system, self.nodes.charts, ts, z[places.x])
         return Guess(states, ts, tuple(z[c] for c in places.controls), design)
 
 
@@ -144,9 +148,7 @@ def _states(system, charts, ts, coordinates):
 
 
 def _times(task: Task, z: np.ndarray, places: Places) -> np.ndarray:
-    if task.moving:
-        return task.t0 + np.append(0.0, np.cumsum(z[places.times]))
-    return task.t0 + task.shares * (z[places.times[0]] if task.timed else task.duration[0])
+    return task.t0 + (task.passed @ z[places.times] if task.timed else task.shares * task.duration[0])
 
 
 class _Transcriber:
@@ -202,13 +204,11 @@ class _Transcriber:
         for end, k in ((task.start, 0), (task.end, -1)):
             if isinstance(end, State):
                 low[places.x[k]] = high[places.x[k]] = nodes.coordinates[k]
-        lengths = np.diff(guess.ts)
-        if task.moving:
-            start[places.times], scale[places.times] = lengths, lengths
-            low[places.times], high[places.times] = _SHORTEST * lengths, _LONGEST * lengths
-        elif task.timed:
-            start[places.times] = scale[places.times] = guess.ts[-1] - guess.ts[0]
-            low[places.times], high[places.times] = task.duration
+        if task.timed:
+            lengths = np.diff(guess.ts[list(task.arcs)])
+            start[places.times] = scale[places.times] = lengths
+            ends = (_SHORTEST * lengths, _LONGEST * lengths) if task.moving else task.duration
+            low[places.times], high[places.times] = ends
         for number, (control, where) in enumerate(zip(task.controls, places.controls, strict=True)):
             ends = [np.ravel(side) for side in task.control_bounds[number]]
             start[where] = guess.controls[number]
@@ -218,7 +218,7 @@ class _Transcriber:
             bounded = np.isfinite(ends[0]) & np.isfinite(ends[1])
             usual = np.ones(control.size) if control_scales is None else control_scales[number]
             scale[where] = np.where(bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual)
-            scale[where[task.intervals + 1 : count]] *= 1.0 / lengths.mean()
+            scale[where[task.intervals + 1 : count]] /= np.mean(np.diff(guess.ts))
         k = 0
         for (_, shape), bounds in zip(task.design, task.design_bounds, strict=True):
             where = places.design[k : k + int(np.prod(shape, dtype=int))]
@@ -251,14 +251,9 @@ class _Transcriber:
 
     def _add_times(self, entries, offset, at, n):
         task, places = self.task, self.places
-        if task.moving:
-            k, j = np.tril_indices(task.intervals, -1)
-            entries.add(at[k, 0], places.times[j])
-            entries.add(at[:, 1], places.times)
-            offset[:, n] = task.t0
-        elif task.timed:
-            entries.add(at[:, 0], places.times, task.shares[:-1])
-            entries.add(at[:, 1], places.times, np.diff(task.shares))
+        if task.timed:
+            entries.add_matrix(at[:, 0], places.times, task.passed[:-1])
+            entries.add_matrix(at[:, 1], places.times, np.diff(task.passed, axis=0))
             offset[:, n] = task.t0
         else:
             offset[:, n] = task.t0 + task.duration[0] * task.shares[:-1]
@@ -272,11 +267,8 @@ class _Transcriber:
         entries, offset = _Entries(), np.zeros((nodes.size, width))
         rows = np.arange(nodes.size)[:, None] * width
         entries.add(rows + np.arange(n), places.x[nodes])
-        if task.moving:
-            for k, node in enumerate(nodes):
-                entries.add(k * width + n, places.times[:node])
-        elif task.timed:
-            entries.add(rows[:, 0] + n, places.times, task.shares[nodes])
+        if task.timed:
+            entries.add_matrix(rows[:, 0] + n, places.times, task.passed[nodes])
         offset[:, n] = task.t0 + (0.0 if task.timed else task.duration[0]) * task.shares[nodes]
         begin = n + 1
         for control, where in zip(task.controls, places.controls, strict=True):
