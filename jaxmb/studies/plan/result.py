@@ -11,6 +11,7 @@ import numpy as np
 
 from ..._printed import Printed
 from ..._types import State
+from ...linalg.arrays import is_traced
 from ...linalg.jitted import jitted
 from ...parts.series import Series
 from ...simulate.simulate import simulate
@@ -18,11 +19,14 @@ from ...system import AbstractSystem, with_inputs, with_parameters
 from ...trajectory import Trajectory
 from ..evaluate import Reading
 from .lanes import Model
-from .solve import Iteration, Solution
+from .sensitivity import Sensitivity, derivatives, sensitivities
+from .solve import Iteration, Solution, solved
 from .task import Limits
 
 # Saved times in each interval, and the tolerance of the simulation that checks a plan.
 _SAVED, _CHECK = 8, 1e-10
+# The largest number of iterations when a plan is found again for other parameters.
+_LIMIT = 300
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -130,6 +134,54 @@ class Plan(Printed):
         values = np.asarray(_along(self.system, limits, self.trajectory.ts, self.trajectory.ys, given))
         excess = np.maximum(np.maximum(limits.low - values, values - limits.high), 0.0)
         return dict(zip(limits.components, map(float, np.max(excess, axis=0)), strict=True))
+
+    def derivatives(self, *names: str) -> dict[str, np.ndarray]:
+        """The derivatives of the objective by parameters of the system, or by a fixed `"duration"`, at the optimum.
+
+        They follow from the multipliers (the envelope theorem), so no motion is optimised again.
+
+        **Raises:** `ValueError` for an unknown parameter, and for one that is optimised itself.
+        """
+        return derivatives(self.solution, names)
+
+    def sensitivities(self, *names: str) -> dict[str, Sensitivity]:
+        """The derivatives of the optimum by parameters of the system, or by a fixed `"duration"`: of controls, duration
+        and designed parameters, by the optimality conditions with the active bounds as they are.
+
+        **Raises:** as `derivatives`.
+        """
+        return sensitivities(self.solution, names)
+
+    def objective_of(self, values: Mapping[str, Any]) -> Any:
+        """The optimal objective for other parameters of the system, found from this plan; differentiable by `jax.grad`.
+
+        ```python
+        slope = jax.grad(lambda mass: best.objective_of({"bar.mass": mass}))(1.2)
+        ```
+
+        Derivatives hold while the same bounds are active. It is computed outside of JAX, so not under `jit` or `vmap`.
+
+        **Raises:** `RuntimeError` if the method does not converge.
+        """
+        names = tuple(values)
+
+        def optimum(values):
+            if is_traced(values):
+                raise ValueError("Plan.objective_of runs outside of JAX: it cannot be used under jit or vmap.")
+            solution, system = self.solution, with_parameters(self.solution.transcription.task.system, values)
+            task = dataclasses.replace(solution.transcription.task, system=system)
+            other = Plan.of(solved(task, solution.found, self.method, _LIMIT, self.tol, lambda _: None), self.method, self.tol)
+            if not other.success:
+                raise RuntimeError(f"Plan.objective_of: the plan for {dict(values)!r} {other.message}.")
+            return other
+
+        def forward(values):
+            other = optimum(values)
+            return jnp.asarray(other.objective), {name: jnp.asarray(x) for name, x in other.derivatives(*names).items()}
+
+        objective = jax.custom_vjp(lambda values: jnp.asarray(optimum(values).objective))
+        objective.defvjp(forward, lambda slopes, cotangent: (jax.tree.map(lambda slope: cotangent * slope, slopes),))
+        return objective({name: jnp.asarray(value, float) for name, value in values.items()})
 
     def __repr__(self) -> str:
         return f"Plan: objective {self.objective:.6g}, duration {self.duration:.6g} s, {self.message}"

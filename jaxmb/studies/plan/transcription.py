@@ -110,7 +110,8 @@ class Transcription:
     """A task as a program near a guess.
 
     **Fields:** the `task`; the `nodes`, charts at the guess; `places` of the variables; the `problem`, and its `start`;
-    `gaps`: rows that join intervals; `rows_of`: rows of `"start"`, `"end"`, `"path"` and `"duration"`.
+    `rows_of`: rows of `"gaps"`, which join intervals, `"start"`,
+    `"end"`, `"path"`, `"period"` and `"duration"`; `scales` of controls without bounds.
     """
 
     task: Task
@@ -118,14 +119,19 @@ class Transcription:
     places: Places
     problem: Problem
     start: np.ndarray
-    gaps: np.ndarray
     rows_of: dict[str, np.ndarray]
+    scales: Sequence[np.ndarray] | None
 
     @classmethod
-    def of(cls, task: Task, guess: Guess, steps: int, control_scales: Sequence[np.ndarray] | None = None) -> "Transcription":
+    def of(
+        cls, task: Task, guess: Guess, steps: int, scales: Sequence[np.ndarray] | None = None, nodes: Nodes | None = None
+    ) -> "Transcription":
+        """**Arguments:** `steps` of each interval; `scales` of controls without bounds; `nodes`, default charts at the
+        guess.
+        """
         model = Model(task.system, task.controls, task.design)
-        nodes = nodes_at(model.designed(jnp.asarray(guess.design)), guess.ts, guess.states)
-        return _Transcriber(task, guess, nodes, model).transcribed(steps, control_scales)
+        nodes = nodes_at(model.designed(jnp.asarray(guess.design)), guess.ts, guess.states) if nodes is None else nodes
+        return _Transcriber(task, guess, nodes, model).transcribed(steps, scales)
 
     def names_at(self, node: int) -> tuple[str, ...]:
         """The names of a node's coordinates and rates."""
@@ -165,7 +171,7 @@ class _Transcriber:
     def transcribed(self, steps: int, control_scales: Any) -> Transcription:
         task, places, nodes = self.task, self.places, self.nodes
         start, scale, low, high = self._variables(control_scales)
-        gaps = self._join(self._arrival(steps))
+        self._join(self._arrival(steps))
         ends = {"start": (task.start, [0]), "end": (task.end, [task.intervals])}
         for where, (limits, at) in ends.items():
             if isinstance(limits, Limits) and limits.names:
@@ -194,7 +200,7 @@ class _Transcriber:
             row_high=np.concatenate(self.high),
             names=self.names,
         )
-        return Transcription(task, nodes, places, problem, start, gaps, self.rows_of)
+        return Transcription(task, nodes, places, problem, start, self.rows_of, control_scales)
 
     def _variables(self, control_scales):
         task, guess, nodes, places = self.task, self.guess, self.nodes, self.places
@@ -225,8 +231,9 @@ class _Transcriber:
             k += where.size
             low[where], high[where] = (np.ravel(side) for side in bounds)
             values = guess.design[k - where.size : k]
-            width = np.where(np.isfinite(high[where] - low[where]), high[where] - low[where], np.maximum(np.abs(values), 1e-3))
-            scale[where], start[where] = width, values
+            width = high[where] - low[where]
+            scale[where] = np.where(np.isfinite(width) & (width > 0), width, np.maximum(np.abs(values), 1e-3))
+            start[where] = values
         return start, scale, low, high
 
     def _arrival(self, steps: int) -> int:
@@ -298,7 +305,7 @@ class _Transcriber:
         self.rows_of[where] = rows
         return rows
 
-    def _join(self, first: int) -> np.ndarray:
+    def _join(self, first: int) -> None:
         task, places, nodes = self.task, self.places, self.nodes
         outputs, indices = self.terms[0].outputs, nodes.charts[1][1:]
         scales = nodes.scales[1:].reshape(-1)
@@ -309,7 +316,6 @@ class _Transcriber:
         self.of_variables.add(rows, places.x[1:].reshape(-1), -1.0 / scales)
         if task.running is not None:
             self.of_outputs.add(0, first + np.arange(1, task.intervals + 1) * outputs - 1)
-        return rows
 
     def _limit(self, where: str, limits: Limits, at: list[int]) -> None:
         count = len(limits.components)
