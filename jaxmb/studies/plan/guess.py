@@ -93,12 +93,12 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     for name in named:
         if name not in known:
             raise unknown("coordinate", name, known, "plan: guess")
-    start, end = (_end(system, given, t, where) for given, t, where in ((task.start, ts[0], "start"), (task.end, ts[-1], "end")))
+    start = _first(system, task.start, ts[0])
     state = start or (task.end if isinstance(task.end, State) else assemble(system, t=ts[0]))
     shares = task.shares[np.unique(np.linspace(0, task.intervals, min(task.intervals, _KNOTS) + 1).round().astype(int))]
     times = ts[0] + (ts[-1] - ts[0]) * shares
     fixed = {name: [value(t) if callable(value) else value for t in times] for name, value in named.items()}
-    if not named and isinstance(task.end, Limits) and (there := _given(task.end, known)):
+    if not named and isinstance(task.end, Limits) and (there := _given(system, task.end, known, state, ts[0])):
         here = evaluate(system, state, list(there), t=ts[0])
         fixed = {name: [(1 - share) * np.asarray(here[name]) + share * value for share in shares] for name, value in there.items()}
     towards = task.end if isinstance(task.end, State) and not named else None
@@ -117,7 +117,7 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     q, z = between(several.q), None if several.z is None else between(several.z)
     slopes = np.gradient(q, ts, axis=0)
     states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
-    return _with_ends(states, start, task.end if isinstance(task.end, State) else end)
+    return _with_ends(states, start, task.end if isinstance(task.end, State) else None)
 
 
 def _assembled(system: AbstractSystem, state: State | None, fix: Mapping[str, Any], t: Scalar, where: str, **rates: Any) -> State:
@@ -128,25 +128,26 @@ def _assembled(system: AbstractSystem, state: State | None, fix: Mapping[str, An
         raise ValueError(f"plan: {where} contradicts the constraints{f', with {given}' if given else ''}: {error}") from None
 
 
-def _end(system: AbstractSystem, given: State | Limits, t: Scalar, where: str) -> State | None:
-    """A state with the coordinates and rates that are given at an end, None if none is."""
+def _first(system: AbstractSystem, given: State | Limits, t: Scalar) -> State | None:
+    """A state with the coordinates and rates that are given at the start, None if none is."""
     if isinstance(given, State):
         return given
-    coordinates = _given(given, (*system.coordinate_names(), *system.joint_coordinates()))
-    rates = _given(given, (*system.rate_names(), *(f"{name}_rate" for name in system.joint_coordinates())))
-    if where == "end" or not (coordinates or rates):
+    if not given.names:
         return None
-    return _assembled(system, None, coordinates, t, f"the {where}", rates=rates or None)
+    state, joints = assemble(system, t=t), system.joint_coordinates()
+    coordinates = _given(system, given, (*system.coordinate_names(), *joints), state, t)
+    rates = _given(system, given, (*system.rate_names(), *(f"{name}_rate" for name in joints)), state, t)
+    return _assembled(system, None, coordinates, t, "the start", rates=rates or None)
 
 
-def _given(limits: Limits, known: Iterable[str]) -> dict[str, np.ndarray]:
-    """The values, or the middles between the bounds, of quantities with known names."""
-    middle, out, begin = 0.5 * (limits.low + limits.high), {}, 0
-    for name, shape in zip(limits.names, limits.shapes, strict=True):
-        own = middle[begin : begin + int(np.prod(shape, dtype=int))].reshape(shape)
-        begin += own.size
-        if name in known and np.all(np.isfinite(own)):
-            out[name] = own
+def _given(system: AbstractSystem, limits: Limits, known: Iterable[str], state: State, t: Scalar) -> dict[str, np.ndarray]:
+    """The values of quantities with known names; within bounds, those next to the values of a state."""
+    begins, known = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in limits.shapes)]), set(known)
+    out = {}
+    for name, shape, a, b in zip(limits.names, limits.shapes, begins[:-1], begins[1:], strict=True):
+        if name in known:
+            low, high = limits.low[a:b].reshape(shape), limits.high[a:b].reshape(shape)
+            out[name] = low if np.all(low == high) else np.clip(evaluate(system, state, name, t=t), low, high)
     return out
 
 

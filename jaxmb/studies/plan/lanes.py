@@ -21,6 +21,8 @@ from .courses import AbstractCourse, Piece
 
 # The number of lanes of one program, whatever the number of intervals.
 _TOGETHER = 8
+# The quality of a chart beyond which its states are refused: steps of a method then stay within it.
+_BORDER = 20.0
 # The step of differences of first derivatives, in units of the scales of the inputs.
 _ASIDE = 1e-6
 
@@ -94,7 +96,8 @@ class Arrival(AbstractLane):
 
     The inputs are the coordinates of the start in its chart, the time of the start and the length [s], the numbers of
     the controls, and the designed parameters. The outputs are all coordinates, velocities and internal states at the
-    end, and the integral of `running(at)` over the interval.
+    end; the quality of the chart at the start; and the integral of `running(at)` over the interval. Near the border of
+    a chart all are NaN.
     """
 
     model: Model
@@ -127,7 +130,9 @@ class Arrival(AbstractLane):
         start = jnp.append(x, 0.0), State(*jax.tree.map(jnp.asarray, _plain(chart[0]))), jnp.zeros((times.size, n + 1))
         y, near, _ = lax.fori_loop(0, steps * times.size, stage, start)
         end = here.state(t0 + h, y[:n], near)
-        return jnp.concatenate([*_plain(end)[: 2 if end.z is None else 3], y[n:]])
+        quality = lax.stop_gradient(here.quality(t0, here.state(t0, x)))
+        outputs = jnp.concatenate([*_plain(end)[: 2 if end.z is None else 3], quality[None], y[n:]])
+        return outputs * jnp.where(quality <= _BORDER, 1.0, jnp.nan)
 
     def _cost(self, system, state, t, pieces, design):
         given = self.model.given(t, {name: piece(t) for name, piece in pieces.items()}, design)

@@ -80,6 +80,11 @@ class Problem:
     def _last(self) -> list[Evaluated]:
         return []
 
+    @property
+    def last(self) -> Evaluated | None:
+        """The last point."""
+        return self._last[0] if self._last else None
+
     def at(self, z: np.ndarray) -> Evaluated:
         """All functions at z; the last point is kept."""
         if self._last and np.array_equal(self._last[0].z, z):

@@ -5,20 +5,18 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from ...linalg.jitted import jitted
-from ...manifold import Chart
 from .guess import Guess
-from .lanes import Model, in_lanes
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
 from .task import Task
 from .transcription import Transcription
 
 # The most rounds; the most steps of an interval; charts beyond this quality are replaced.
-_ROUNDS, _MOST_STEPS, _WORN = 8, 512, 2.0
+_ROUNDS, _MOST_STEPS, _WORN = 40, 256, 3.0
+# The factor by which a round may have more steps than the last: far from a motion, errors are no measure.
+_FURTHER = 4
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
 _SMALL_JUMP, _SWITCH = 0.02, 0.4
 
@@ -54,32 +52,34 @@ def solved(
 
     **Raises:** `ValueError` if a segment fails with the guess, or if conditions depend on each other.
     """
-    begin, steps, scales = time.perf_counter(), 1, None
+    begin, steps, scales, answer = time.perf_counter(), 1, None, None
     log: list[Iteration] = []
-
-    def watched(objective: float, violation: float) -> None:
-        log.append(Iteration(len(log) + 1, objective, violation, time.perf_counter() - begin))
-        told(log[-1])
-
     for number in range(_ROUNDS):
         transcription = Transcription.of(task, guess, steps, scales)
-        steps, _ = _enough_steps(transcription, transcription.start, steps, tol)
+        steps, _ = _enough_steps(transcription, transcription.start, steps, tol, _MOST_STEPS if scales is None else steps)
         at = transcription.problem.at(transcription.start)
         if scales is None:
             _check_start(transcription, at)
             _check_ends(transcription, at)
             scales = _control_scales(transcription, at)
             transcription = Transcription.of(task, guess, steps, scales)
-        problem = transcription.problem
+
+        def watched(objective: float, violation: float, transcription=transcription) -> bool:
+            log.append(Iteration(len(log) + 1, objective, violation, time.perf_counter() - begin))
+            told(log[-1])
+            return transcription.quality() <= _WORN or len(log) == 1
+
+        problem, left = transcription.problem, max(limit - len(log), 1)
         chosen = chosen_method(method, problem.scale.size)
-        near = number > 0
-        answer = minimise(problem, transcription.start, near, chosen, max(limit - len(log), 1), tol, watched)
-        guess, before = transcription.read(answer.z), steps
-        steps, error = _enough_steps(transcription, answer.z, steps, tol)
-        worn = _quality(transcription, answer.z, guess)
-        is_last = answer.interrupted or len(log) >= limit or not np.isfinite(worn) or number == _ROUNDS - 1
+        answer = minimise(problem, transcription.start, answer, chosen, left, tol, watched)
+        problem.at(answer.z)
+        worn, before, last = transcription.quality(), steps, guess
+        guess = transcription.read(answer.z)
+        steps, error = _enough_steps(transcription, answer.z, steps, tol, _FURTHER * steps)
+        lost = not all(np.all(np.isfinite(x)) for x in (guess.states.q, guess.states.u))
+        is_last = answer.interrupted or len(log) >= limit or lost or number == _ROUNDS - 1
         if is_last or (steps == before and worn <= _WORN):
-            return Solution(transcription, answer, guess, tuple(log), error)
+            return Solution(transcription, answer, last if lost else guess, tuple(log), error)
     raise AssertionError
 
 
@@ -102,14 +102,16 @@ def arcs_of(task: Task, found: Guess) -> tuple[int, ...]:
     return (0, *sorted(switches), task.intervals)
 
 
-def _enough_steps(transcription: Transcription, z: np.ndarray, steps: int, tol: float) -> tuple[int, float]:
+def _enough_steps(
+    transcription: Transcription, z: np.ndarray, steps: int, tol: float, most: int = _MOST_STEPS
+) -> tuple[int, float]:
     """The number of steps in an interval that makes the errors of its end small, and the largest error then, relative
-    to typical changes, by comparison with twice as many.
+    to typical changes, by comparison with twice as many; `most` at most.
     """
     term, nodes = transcription.problem.terms[0], transcription.nodes
     inputs, indices = term.at(z), nodes.charts[1][1:]
     coarse, error = None, np.inf
-    while steps <= _MOST_STEPS:
+    while steps <= most:
         fine = term.block.linearised(inputs, 2 * steps)[0]
         coarse = term.block.linearised(inputs, steps)[0] if coarse is None else coarse
         differences = np.take_along_axis(fine - coarse, indices, 1) / nodes.scales[1:]
@@ -117,7 +119,7 @@ def _enough_steps(transcription: Transcription, z: np.ndarray, steps: int, tol: 
         if error <= max(tol, 1e-10):
             break
         steps, coarse = 2 * steps, fine
-    term.block.steps = min(steps, _MOST_STEPS)
+    term.block.steps = min(steps, most)
     return term.block.steps, error
 
 
@@ -167,20 +169,3 @@ def _control_scales(transcription: Transcription, at: Evaluated) -> list[np.ndar
         begin += control.size * control.course.local
         out.append(np.where(own > 0, 1.0 / (np.where(own > 0, own, 1.0) * task.intervals), 1.0))
     return out
-
-
-@jitted
-def _growth(system, charts, ts, coordinates):
-    def of_one(chart, t, x):
-        here = Chart(system, *chart)
-        return here.quality(t, here.state(t, x))
-
-    return jax.vmap(of_one)(charts, ts, coordinates)
-
-
-def _quality(transcription: Transcription, z: np.ndarray, guess: Guess) -> float:
-    """The largest quality of a node's chart; infinite where a state is lost."""
-    task = transcription.task
-    system = Model(task.system, task.controls, task.design).designed(guess.design)
-    growth = in_lanes(_growth, system, transcription.nodes.charts, guess.ts, z[transcription.places.x])
-    return float(np.max(np.where(np.isfinite(growth), growth, np.inf)))

@@ -13,12 +13,15 @@ from .problem import Evaluated, Problem
 _SMALL = 400
 # The objective of a failed trial, in units of the last.
 _FAILED = 1e10
-_SOLVED, _ACCEPTABLE = 0, 1
+_SOLVED, _ACCEPTABLE, _STOPPED = 0, 1, 5
+# IPOPT's first weight of the barrier.
+_BARRIER = 0.1
 _MESSAGES = {
     0: "converged",
     1: "converged to a lower accuracy",
     2: "no point near the last satisfies the constraints",
     3: "the step became too small",
+    5: "stopped to change charts",
     -1: "the limit of iterations was reached",
     -2: "the search for points on the constraints failed",
     -3: "no step could be computed",
@@ -28,7 +31,7 @@ _MESSAGES = {
 
 class Answer(NamedTuple):
     """The end of a method: the variables, multipliers of the rows and of the bounds (positive at upper bounds), whether
-    the method converged, its message, and whether Ctrl-C ended it.
+    the method converged, its message, and whether Ctrl-C ended it; the last weight of IPOPT's `barrier`.
     """
 
     z: np.ndarray
@@ -37,18 +40,21 @@ class Answer(NamedTuple):
     success: bool
     message: str
     interrupted: bool = False
+    barrier: float = 0.0
 
 
-# Told of each iteration: the objective, and the largest violation of a row.
-Told = Callable[[float, float], None]
+# Told of each iteration: the objective, and the largest violation of a row; whether to go on.
+Told = Callable[[float, float], bool]
 
 
-def minimise(problem: Problem, z: np.ndarray, near: bool, method: str, limit: int, tol: float, told: Told) -> Answer:
+def minimise(
+    problem: Problem, z: np.ndarray, before: Answer | None, method: str, limit: int, tol: float, told: Told
+) -> Answer:
     """The local minimum near z.
 
-    **Arguments:** `near`: whether z is nearly the minimum; `limit`: the largest number of iterations.
+    **Arguments:** `before`: the answer in other charts that led to z; `limit`: the largest number of iterations.
     """
-    return _ipopt(problem, z, near, limit, tol, told) if method == "ipopt" else _slsqp(problem, z, limit, tol, told)
+    return _ipopt(problem, z, before, limit, tol, told) if method == "ipopt" else _slsqp(problem, z, limit, tol, told)
 
 
 def chosen_method(method: str | None, size: int) -> str:
@@ -70,12 +76,12 @@ def chosen_method(method: str | None, size: int) -> str:
     return chosen
 
 
-def _ipopt(problem: Problem, z: np.ndarray, near: bool, limit: int, tol: float, told: Told) -> Answer:
+def _ipopt(problem: Problem, z: np.ndarray, before: Answer | None, limit: int, tol: float, told: Told) -> Answer:
     import ipyopt
 
     scale, count = problem.scale, problem.row_low.size
     rows, columns = problem.places
-    first, interrupted = rows == 0, False
+    first, interrupted, barrier = rows == 0, False, _BARRIER
     pairs = np.prod([scale[places] for places in problem.lower_places], axis=0)
 
     def filled(function):
@@ -102,12 +108,13 @@ def _ipopt(problem: Problem, z: np.ndarray, near: bool, limit: int, tol: float, 
         filled(lambda here: here.rows[:1])(w, value)
         return float(value[0])
 
-    def after(mode, number, value, violation, *_):
-        told(value, violation)
-        return not interrupted
+    def after(mode, number, value, violation, of_dual, mu, *_):
+        nonlocal barrier
+        barrier = mu
+        return told(value, violation) and not interrupted
 
     options = {"print_level": 0, "sb": "yes", "tol": tol, "constr_viol_tol": tol, "max_iter": limit}
-    options |= {"bound_relax_factor": 0.0, **({"mu_init": 1e-5} if near else {})}
+    options |= {"bound_relax_factor": 0.0, "mu_init": _BARRIER if before is None else max(before.barrier, tol)}
     program = ipyopt.Problem(
         n=scale.size,
         x_l=problem.low / scale,
@@ -128,7 +135,7 @@ def _ipopt(problem: Problem, z: np.ndarray, near: bool, limit: int, tol: float, 
     multipliers, below, above = np.zeros(count), np.zeros(scale.size), np.zeros(scale.size)
     w, _, status = program.solve(z / scale, mult_g=multipliers, mult_x_L=below, mult_x_U=above)
     message = "interrupted" if interrupted else _MESSAGES.get(status, f"IPOPT ended with status {status}")
-    return Answer(w * scale, multipliers, (above - below) / scale, status in (_SOLVED, _ACCEPTABLE), message, interrupted)
+    return Answer(w * scale, multipliers, (above - below) / scale, status in (_SOLVED, _ACCEPTABLE), message, interrupted, barrier)
 
 
 def _slsqp(problem: Problem, z: np.ndarray, limit: int, tol: float, told: Told) -> Answer:
@@ -164,7 +171,8 @@ def _slsqp(problem: Problem, z: np.ndarray, limit: int, tol: float, told: Told) 
         nonlocal last
         last, rows = np.array(w), at(w).rows
         excess = np.maximum(problem.row_low - rows[1:], rows[1:] - problem.row_high)
-        told(float(rows[0]), float(np.max(excess, initial=0.0)))
+        if not told(float(rows[0]), float(np.max(excess, initial=0.0))):
+            raise StopIteration
 
     interrupted, success, message = False, False, "interrupted"
     try:
@@ -179,6 +187,8 @@ def _slsqp(problem: Problem, z: np.ndarray, limit: int, tol: float, told: Told) 
             method="SLSQP",
         )
         last, success, message = found.x, bool(found.success), str(found.message).lower()
+    except StopIteration:
+        message = _MESSAGES[_STOPPED]
     except KeyboardInterrupt:
         interrupted = True
     here = at(last)

@@ -133,6 +133,12 @@ class Transcription:
         nodes = nodes_at(model.designed(jnp.asarray(guess.design)), guess.ts, guess.states) if nodes is None else nodes
         return _Transcriber(task, guess, nodes, model).transcribed(steps, scales)
 
+    def quality(self) -> float:
+        """The largest quality of the charts of the intervals at the last point; infinite where a state is lost."""
+        last = self.problem.last
+        quality = np.inf if last is None else float(np.max(last.outputs[0][:, -2]))
+        return quality if np.isfinite(quality) else np.inf
+
     def names_at(self, node: int) -> tuple[str, ...]:
         """The names of a node's coordinates and rates."""
         chart = Chart(self.task.system, *jax.tree.map(lambda x: x[node], self.nodes.charts))
@@ -251,7 +257,7 @@ class _Transcriber:
             local = where[control.course.places(task.intervals)].reshape(task.intervals, -1)
             entries.add(at(begin, local.shape[1]), local)
         entries.add(at(begins[-2], places.design.size), places.design)
-        outputs = self.nodes.charts[0].q.shape[1] + self.nodes.charts[0].u.shape[1] + (task.system.nz or 0) + 1
+        outputs = self.nodes.charts[0].q.shape[1] + self.nodes.charts[0].u.shape[1] + (task.system.nz or 0) + 2
         charts = jax.tree.map(lambda x: x[:-1], self.nodes.charts)
         inputs = entries.matrix((task.intervals * width, places.size))
         return self._term(Arrival(self.model, task.running), charts, inputs, offset, outputs, steps)
