@@ -109,9 +109,7 @@ class Chart(eqx.Module):
         """The rates of x by the equations of motion; NaN where no state is found. Arguments as of `state`."""
         return self.moving(t, x, near)[1]
 
-    def moving(
-        self, t: Scalar, x: Float[Array, "n"], near: State | None = None
-    ) -> tuple[State, Float[Array, "n"]]:
+    def moving(self, t: Scalar, x: Float[Array, "n"], near: State | None = None) -> tuple[State, Float[Array, "n"]]:
         """The state on the constraints, as `state`, and the rates of x there, as `field`; both in one computation."""
         return _moving(self, t, x, near)
 

@@ -1,5 +1,6 @@
 """First states of a plan: straight in coordinates from the start to the end, on the constraints; or along a motion."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ from ...trajectory import Trajectory
 from ..evaluate import evaluate
 from .lanes import in_lanes
 from .task import Limits, Task
-
 
 # The largest number of intervals between states that are assembled, and corrections of states between them.
 _KNOTS, _CORRECTIONS = 12, 4
@@ -48,7 +48,10 @@ def first_guess(task: Task, given: Any) -> Guess:
     ts = task.t0 + duration * task.shares
     system, design = _designed(task, named, motion)
     controls = _controls(task, named, motion, ts)
-    first = {c.name: jnp.asarray(c.course.series(ts, x.reshape(-1, *c.shape))(ts[0])) for c, x in zip(task.controls, controls, strict=True)}
+    first = {
+        c.name: jnp.asarray(c.course.series(ts, x.reshape(-1, *c.shape))(ts[0]))
+        for c, x in zip(task.controls, controls, strict=True)
+    }
     system = with_parameters(system, first)
     states = _along(task, system, motion, ts) if motion is not None else _straight(task, system, named, ts)
     return Guess(states, ts, controls, design)
@@ -100,7 +103,10 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     fixed = {name: [value(t) if callable(value) else value for t in times] for name, value in named.items()}
     if not named and isinstance(task.end, Limits) and (there := _given(system, task.end, known, state, ts[0])):
         here = evaluate(system, state, list(there), t=ts[0])
-        fixed = {name: [(1 - share) * np.asarray(here[name]) + share * value for share in shares] for name, value in there.items()}
+        fixed = {
+            name: [(1 - share) * np.asarray(here[name]) + share * value for share in shares]
+            for name, value in there.items()
+        }
     towards = task.end if isinstance(task.end, State) and not named else None
     states = []
     for k, t in enumerate(times):
@@ -120,12 +126,19 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     return _with_ends(states, start, task.end if isinstance(task.end, State) else None)
 
 
-def _assembled(system: AbstractSystem, state: State | None, fix: Mapping[str, Any], t: Scalar, where: str, **rates: Any) -> State:
+def _assembled(
+    system: AbstractSystem, state: State | None, fix: Mapping[str, Any], t: Scalar, where: str, **rates: Any
+) -> State:
     try:
-        return assemble(system, state, fix=dict(fix) or None, t=t, **rates)
+        with warnings.catch_warnings():
+            # Angles along the way may pass full turns.
+            warnings.simplefilter("ignore")
+            return assemble(system, state, fix=dict(fix) or None, t=t, **rates)
     except ValueError as error:
         given = ", ".join(f"{name} = {np.array2string(np.asarray(value), precision=4)}" for name, value in fix.items())
-        raise ValueError(f"plan: {where} contradicts the constraints{f', with {given}' if given else ''}: {error}") from None
+        raise ValueError(
+            f"plan: {where} contradicts the constraints{f', with {given}' if given else ''}: {error}"
+        ) from None
 
 
 def _first(system: AbstractSystem, given: State | Limits, t: Scalar) -> State | None:
@@ -140,7 +153,9 @@ def _first(system: AbstractSystem, given: State | Limits, t: Scalar) -> State | 
     return _assembled(system, None, coordinates, t, "the start", rates=rates or None)
 
 
-def _given(system: AbstractSystem, limits: Limits, known: Iterable[str], state: State, t: Scalar) -> dict[str, np.ndarray]:
+def _given(
+    system: AbstractSystem, limits: Limits, known: Iterable[str], state: State, t: Scalar
+) -> dict[str, np.ndarray]:
     """The values of quantities with known names; within bounds, those next to the values of a state."""
     begins, known = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in limits.shapes)]), set(known)
     out = {}
@@ -188,12 +203,16 @@ def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> S
     if times.ndim != 1 or times.size < 2:
         raise ValueError("plan: a motion as the guess needs at least two saved times: simulate(…, saveat=times).")
     if np.shape(ys.q)[1:] != (system.nq,):
-        raise ValueError(f"plan: the guess is a motion of another system, with {np.shape(ys.q)[1]} coordinates instead of {system.nq}.")
+        raise ValueError(
+            f"plan: the guess is a motion of another system, with {np.shape(ys.q)[1]} coordinates instead of {system.nq}."
+        )
     places = times[0] + (times[-1] - times[0]) * task.shares
     between = lambda y: np.stack([np.interp(places, times, column) for column in np.asarray(y).T], axis=1)
     q, z = between(ys.q), None if ys.z is None else between(ys.z)
     # Another duration has other rates.
-    slopes = between(in_lanes(_rates, system, times, State(ys.q, ys.u, ys.z))) * (times[-1] - times[0]) / (ts[-1] - ts[0])
+    slopes = (
+        between(in_lanes(_rates, system, times, State(ys.q, ys.u, ys.z))) * (times[-1] - times[0]) / (ts[-1] - ts[0])
+    )
     states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
     return _with_ends(states, *(x if isinstance(x, State) else None for x in (task.start, task.end)))
 

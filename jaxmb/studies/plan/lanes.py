@@ -220,7 +220,9 @@ class Block:
         for k, place in enumerate(active):
             moved[:, k, :, place] += sides[:, None] * aside[:, k]
         charts = jax.tree.map(lambda x: np.concatenate([x] * (sides.size * active.size)), self.charts)
-        slopes = in_lanes(_linearised, (self.lane, np.asarray(self.steps), self.active), charts, moved.reshape(-1, inputs.shape[1]))[1]
+        slopes = in_lanes(
+            _linearised, (self.lane, np.asarray(self.steps), self.active), charts, moved.reshape(-1, inputs.shape[1])
+        )[1]
         slopes = slopes.reshape(sides.size, active.size, *first.shape)
         change, width = (slopes[0] - slopes[1], 2 * aside) if central else (slopes[0] - first, aside)
         second = np.einsum("kloj,lo->lkj", change, weights) / width[:, :, None]

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import ArrayLike
 
 from ..._arguments import check_kind, real_array, whole_number
@@ -145,7 +144,10 @@ def _task(system, *, controls, duration, ends, objective, path, design, periodic
     running, final = objective
     if running is None and final is None:
         raise ValueError(f"plan: there is nothing to minimise; give {_OBJECTIVES}.")
-    if any(not (given is None or given == word or callable(given)) for given, word in ((running, "effort"), (final, "time"))):
+    if any(
+        not (given is None or given == word or callable(given))
+        for given, word in ((running, "effort"), (final, "time"))
+    ):
         raise ValueError(f"plan: give {_OBJECTIVES}; got {running!r} and {final!r}.")
     shares = checked_shares(intervals)
     return Task(

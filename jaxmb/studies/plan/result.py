@@ -76,7 +76,8 @@ class Plan(Printed):
         problem = solution.transcription.problem
         return cls(
             system=design.designed(jnp.asarray(found.design)),
-            objective=float(problem.at(solution.answer.z).rows[0]) + (0.0 if task.timed else task.of_time * task.duration[0]),
+            objective=float(problem.at(solution.answer.z).rows[0])
+            + (0.0 if task.timed else task.of_time * task.duration[0]),
             ts=found.ts,
             states=found.states,
             controls={control.name: control.course.series(found.ts, own) for control, own in each},
@@ -103,7 +104,9 @@ class Plan(Printed):
         in `trajectory.error`.
         """
         start = jax.tree.map(lambda y: y[0], self.states)
-        times = np.interp(np.linspace(0, len(self.ts) - 1, _SAVED * (len(self.ts) - 1) + 1), range(len(self.ts)), self.ts)
+        times = np.interp(
+            np.linspace(0, len(self.ts) - 1, _SAVED * (len(self.ts) - 1) + 1), range(len(self.ts)), self.ts
+        )
         return simulate(
             with_inputs(self.system, self.controls),
             start,
@@ -122,7 +125,12 @@ class Plan(Printed):
         """
         end, there = (jax.tree.map(lambda y: np.asarray(y[-1]), ys) for ys in (self.trajectory.ys, self.states))
         scale = [max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u)]
-        return float(max(np.max(np.abs(a - b), initial=0.0) / s for a, b, s in zip((end.q, end.u), (there.q, there.u), scale, strict=True)))
+        return float(
+            max(
+                np.max(np.abs(a - b), initial=0.0) / s
+                for a, b, s in zip((end.q, end.u), (there.q, there.u), scale, strict=True)
+            )
+        )
 
     @functools.cached_property
     def violation(self) -> dict[str, float]:
@@ -170,7 +178,9 @@ class Plan(Printed):
                 raise ValueError("Plan.objective_of runs outside of JAX: it cannot be used under jit or vmap.")
             solution, system = self.solution, with_parameters(self.solution.transcription.task.system, values)
             task = dataclasses.replace(solution.transcription.task, system=system)
-            other = Plan.of(solved(task, solution.found, self.method, _LIMIT, self.tol, lambda _: None), self.method, self.tol)
+            other = Plan.of(
+                solved(task, solution.found, self.method, _LIMIT, self.tol, lambda _: None), self.method, self.tol
+            )
             if not other.success:
                 raise RuntimeError(f"Plan.objective_of: the plan for {dict(values)!r} {other.message}.")
             return other
@@ -187,7 +197,11 @@ class Plan(Printed):
         return f"Plan: objective {self.objective:.6g}, duration {self.duration:.6g} s, {self.message}"
 
     def __str__(self) -> str:
-        rows: list[tuple[str, ...]] = [("objective", f"{self.objective:.9g}"), ("duration [s]", f"{self.duration:.9g}"), ()]
+        rows: list[tuple[str, ...]] = [
+            ("objective", f"{self.objective:.9g}"),
+            ("duration [s]", f"{self.duration:.9g}"),
+            (),
+        ]
         rows.append(("control", "start", "end", "least", "largest"))
         for name, series in self.controls.items():
             values = np.asarray(series.values).reshape(len(self.ts), -1)
@@ -202,7 +216,11 @@ class Plan(Printed):
             rows += [(name, np.array2string(value, precision=6)) for name, value in self.prices.items()]
         if self.active:
             rows += [(), ("at a bound", ", ".join(self.active))]
-        rows += [(), ("iterations", str(len(self.iterations))), ("error of integration", f"{self.integration_error:.1e}")]
+        rows += [
+            (),
+            ("iterations", str(len(self.iterations))),
+            ("error of integration", f"{self.integration_error:.1e}"),
+        ]
         width = max(len(row[0]) for row in rows if row)
         lines = [f"{row[0]:{width}}" + "".join(f"  {cell:>12}" for cell in row[1:]) if row else "" for row in rows]
         return "\n".join([*(line.rstrip() for line in lines), "", self.message])
@@ -228,7 +246,7 @@ def _prices(solution: Solution) -> dict[str, np.ndarray]:
             out |= {f"{where} {name}": value for name, value in zip(names, values, strict=True)}
         elif limits.names:
             rows = transcription.rows_of[where] - 1
-            values = (-answer.multipliers[rows].reshape(-1, len(limits.components)) / limits.sizes)
+            values = -answer.multipliers[rows].reshape(-1, len(limits.components)) / limits.sizes
             chosen = values[np.argmax(np.abs(values), axis=0), np.arange(values.shape[1])]
             out |= {f"{where} {name}": value for name, value in zip(limits.components, chosen, strict=True)}
     return out
@@ -240,11 +258,21 @@ def _active(solution: Solution) -> tuple[str, ...]:
     at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= 1e-6 * problem.scale
     out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
     begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
-    out += [name for (name, _), a, b in zip(task.design, begins[:-1], begins[1:], strict=True) if at_bound[places.design[a:b]].any()]
+    out += [
+        name
+        for (name, _), a, b in zip(task.design, begins[:-1], begins[1:], strict=True)
+        if at_bound[places.design[a:b]].any()
+    ]
     out += ["duration"] if not task.moving and task.timed and at_bound[places.times].any() else []
     if task.path.names:
         rows = transcription.rows_of["path"] - 1
         values = problem.at(z).rows[1:][rows]
         near = np.minimum(np.abs(values - problem.row_low[rows]), np.abs(values - problem.row_high[rows])) <= 1e-6
-        out += [name for name, is_near in zip(task.path.components, near.reshape(-1, len(task.path.components)).any(axis=0), strict=True) if is_near]
+        out += [
+            name
+            for name, is_near in zip(
+                task.path.components, near.reshape(-1, len(task.path.components)).any(axis=0), strict=True
+            )
+            if is_near
+        ]
     return tuple(out)

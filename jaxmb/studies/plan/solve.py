@@ -56,7 +56,9 @@ def solved(
     log: list[Iteration] = []
     for number in range(_ROUNDS):
         transcription = Transcription.of(task, guess, steps, scales)
-        steps, _ = _enough_steps(transcription, transcription.start, steps, tol, _MOST_STEPS if scales is None else steps)
+        steps, _ = _enough_steps(
+            transcription, transcription.start, steps, tol, _MOST_STEPS if scales is None else steps
+        )
         at = transcription.problem.at(transcription.start)
         if scales is None:
             _check_start(transcription, at)
@@ -126,7 +128,10 @@ def _enough_steps(
 def _check_start(transcription: Transcription, at: Evaluated) -> None:
     if at.finite:
         return
-    bad = [not np.all(np.isfinite(np.concatenate([y, jacobian.reshape(-1)]))) for y, jacobian in zip(at.outputs[0], at.jacobians[0], strict=True)]
+    bad = [
+        not np.all(np.isfinite(np.concatenate([y, jacobian.reshape(-1)])))
+        for y, jacobian in zip(at.outputs[0], at.jacobians[0], strict=True)
+    ]
     if any(bad):
         k = int(np.argmax(bad))
         ts = transcription.read(transcription.start).ts

@@ -170,7 +170,12 @@ def checked_limits(system: AbstractSystem, where: str, given: Any, others: Mappi
     for name, value in (given or {}).items():
         shape = _shape(system, name, others, where)
         pair = value if isinstance(value, tuple) and len(value) == 2 and shape != (2,) else (value, value)
-        if isinstance(value, tuple) and len(value) == 2 and shape == (2,) and any(np.ndim(x) or x is None for x in value):
+        if (
+            isinstance(value, tuple)
+            and len(value) == 2
+            and shape == (2,)
+            and any(np.ndim(x) or x is None for x in value)
+        ):
             pair = value
         low, high = bounds_of(f"plan: {where} of {name!r}", pair, shape, equal=True)
         shapes.append(shape)
@@ -195,14 +200,18 @@ def checked_duration(given: Any) -> tuple[float, float]:
     pair = given if isinstance(given, tuple) else (given, given)
     low, high = (float(x) for x in bounds_of("plan: duration", pair, (), equal=True))
     if not (low > 0 and np.isfinite(high)):
-        raise ValueError(f"plan: duration must be a positive number of seconds, or two of them (low, high); got {given!r}.")
+        raise ValueError(
+            f"plan: duration must be a positive number of seconds, or two of them (low, high); got {given!r}."
+        )
     return low, high
 
 
 def checked_shares(intervals: Any) -> np.ndarray:
     """The nodes as shares of the duration, from the number of intervals or from ascending shares."""
     if np.ndim(intervals) == 0:
-        return np.linspace(0.0, 1.0, whole_number("plan: intervals", intervals, 1, ", or ascending shares from 0 to 1") + 1)
+        return np.linspace(
+            0.0, 1.0, whole_number("plan: intervals", intervals, 1, ", or ascending shares from 0 to 1") + 1
+        )
     shares = np.asarray(real_array("plan: intervals", intervals, float, None))
     if shares.ndim != 1 or shares.size < 2 or shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
         raise ValueError(f"plan: intervals must be a number, or ascending shares from 0 to 1; got {intervals!r}.")

@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,14 +75,15 @@ class _Entries:
         self.add(rows[i], columns[j], matrix[i, j])
 
     def matrix(self, shape: tuple[int, int]) -> sparse.csr_array:
-        rows, columns, values = (np.concatenate([np.zeros(0, kind), *(p[k] for p in self.parts)]) for k, kind in enumerate((int, int, float)))
+        rows, columns, values = (
+            np.concatenate([np.zeros(0, kind), *(p[k] for p in self.parts)]) for k, kind in enumerate((int, int, float))
+        )
         return sparse.csr_array((values, (rows, columns)), shape=shape)
 
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """The places of variables: `x`, shape (nodes, coordinates); `times`: the lengths of arcs, or nothing; `controls`, one array of shape (numbers, components) for each; `design`.
-    """
+    """The places of variables: `x`, shape (nodes, coordinates); `times`: the lengths of arcs, or nothing; `controls`, one array of shape (numbers, components) for each; `design`."""
 
     x: np.ndarray
     times: np.ndarray
@@ -124,7 +124,12 @@ class Transcription:
 
     @classmethod
     def of(
-        cls, task: Task, guess: Guess, steps: int, scales: Sequence[np.ndarray] | None = None, nodes: Nodes | None = None
+        cls,
+        task: Task,
+        guess: Guess,
+        steps: int,
+        scales: Sequence[np.ndarray] | None = None,
+        nodes: Nodes | None = None,
     ) -> "Transcription":
         """**Arguments:** `steps` of each interval; `scales` of controls without bounds; `nodes`, default charts at the
         guess.
@@ -229,7 +234,9 @@ class _Transcriber:
             low[values], high[values] = ends
             bounded = np.isfinite(ends[0]) & np.isfinite(ends[1])
             usual = np.ones(control.size) if control_scales is None else control_scales[number]
-            scale[where] = np.where(bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual)
+            scale[where] = np.where(
+                bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual
+            )
             scale[where[task.intervals + 1 : count]] /= np.mean(np.diff(guess.ts))
         k = 0
         for (_, shape), bounds in zip(task.design, task.design_bounds, strict=True):
