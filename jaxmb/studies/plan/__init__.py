@@ -2,3 +2,4 @@
 
 from .plan import plan as plan
 from .result import Plan as Plan
+from .phases import Phase as Phase, PhasedPlan as PhasedPlan, plan_phases as plan_phases

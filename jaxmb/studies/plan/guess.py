@@ -10,6 +10,7 @@ import numpy as np
 
 from ..._types import Scalar, State
 from ...linalg.jitted import jitted
+from ...manifold import Chart
 from ...parts.names import unknown
 from ...parts.series import AbstractSignal
 from ...states.assembly import assemble
@@ -35,8 +36,10 @@ class Guess(NamedTuple):
     design: np.ndarray
 
 
-def first_guess(task: Task, given: Any) -> Guess:
+def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
     """The guess of a task from a user's guess: None, values by name, a motion, or another plan.
+
+    **Arguments:** `begin`: the state at the start, if the task gives none.
 
     **Raises:** `ValueError` for unknown names, and for ends that cannot be assembled.
     """
@@ -53,7 +56,7 @@ def first_guess(task: Task, given: Any) -> Guess:
         for c, x in zip(task.controls, controls, strict=True)
     }
     system = with_parameters(system, first)
-    states = _along(task, system, motion, ts) if motion is not None else _straight(task, system, named, ts)
+    states = _along(task, system, motion, ts) if motion is not None else _straight(task, system, named, ts, begin)
     return Guess(states, ts, controls, design)
 
 
@@ -88,7 +91,9 @@ def _controls(task, named, motion, ts):
     return tuple(out)
 
 
-def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray) -> State:
+def _straight(
+    task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None
+) -> State:
     """Coordinates by name along the way, or straight from the start to the end; on the constraints at some times, one
     after the other, and between them nearly straight.
     """
@@ -96,7 +101,7 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     for name in named:
         if name not in known:
             raise unknown("coordinate", name, known, "plan: guess")
-    start = _first(system, task.start, ts[0])
+    start = _first(system, task.start, ts[0]) or begin
     state = start or (task.end if isinstance(task.end, State) else assemble(system, t=ts[0]))
     shares = task.shares[np.unique(np.linspace(0, task.intervals, min(task.intervals, _KNOTS) + 1).round().astype(int))]
     times = ts[0] + (ts[-1] - ts[0]) * shares
@@ -139,6 +144,21 @@ def _assembled(
         raise ValueError(
             f"plan: {where} contradicts the constraints{f', with {given}' if given else ''}: {error}"
         ) from None
+
+
+def carried(before: AbstractSystem, state: State, system: AbstractSystem, t: Scalar) -> State:
+    """The state of a system with the independent coordinates and rates of the state of another one, by their names.
+
+    **Raises:** `ValueError` naming coordinates that the system has not.
+    """
+    names, known = Chart.at(before, t, state).names, (*system.coordinate_names(), *system.joint_coordinates())
+    values = {name: evaluate(before, state, name, t=t) for name in names}
+    rates = {name: value for name, value in values.items() if name.endswith("_rate")}
+    coordinates = {name: value for name, value in values.items() if name not in rates}
+    for name in coordinates:
+        if name not in known:
+            raise unknown("coordinate", name, known, "plan_phases: a phase begins where the last ended")
+    return _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
 
 
 def _first(system: AbstractSystem, given: State | Limits, t: Scalar) -> State | None:

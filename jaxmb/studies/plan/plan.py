@@ -1,7 +1,7 @@
 """Optimal control: controls, duration and parameters of a motion between two ends that minimise an objective."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -102,7 +102,7 @@ def plan(
     **Raises:** `ValueError` for unknown names, reversed bounds, ends that contradict the constraints, conditions that
     depend on each other, and a guess that cannot be integrated.
     """
-    task = _task(
+    task = task_of(
         system,
         controls=controls,
         duration=duration,
@@ -114,15 +114,32 @@ def plan(
         nodes=(intervals, interpolation),
         t0=t0,
     )
+    check_minimised([(running, final)])
+    options = method_options(method, max_iterations, tol, verbose)
+    (solution,) = solved([task], [first_guess(task, guess)], *options)
+    if moving and solution.answer.success:
+        first, task = solution.iterations, dataclasses.replace(task, arcs=arcs_of(task, solution.found))
+        (solution,) = solved([task], [solution.found], *options)
+        solution = dataclasses.replace(solution, iterations=(*first, *solution.iterations))
+    return Plan.of(solution, method, tol)
+
+
+def method_options(method: Any, max_iterations: Any, tol: Any, verbose: bool) -> tuple[Any, int, float, Any]:
+    """The checked options of `solved`."""
     whole_number("plan: max_iterations", max_iterations)
     if not tol > 0:
         raise ValueError(f"plan: tol must be positive, got {tol!r}.")
-    told = _print if verbose else lambda iteration: None
-    solution = solved(task, first_guess(task, guess), method, max_iterations, tol, told)
-    if moving and solution.answer.success:
-        arcs = arcs_of(task, solution.found)
-        solution = solved(dataclasses.replace(task, arcs=arcs), solution.found, method, max_iterations, tol, told)
-    return Plan.of(solution, method, tol)
+    return method, max_iterations, tol, _print if verbose else lambda iteration: None
+
+
+def check_minimised(objectives: Sequence[tuple[Any, Any]]) -> None:
+    """Refuse objectives of phases, `(running, final)`, of another kind, or none at all."""
+    if all(running is None and final is None for running, final in objectives):
+        raise ValueError(f"plan: there is nothing to minimise; give {_OBJECTIVES}.")
+    for running, final in objectives:
+        for given, word in ((running, "effort"), (final, "time")):
+            if not (given is None or given == word or callable(given)):
+                raise ValueError(f"plan: give {_OBJECTIVES}; got {given!r}.")
 
 
 def _print(iteration: Iteration) -> None:
@@ -130,7 +147,20 @@ def _print(iteration: Iteration) -> None:
     print(f"{number:4d}  objective {objective:16.9g}  violation {violation:8.1e}  {seconds:7.1f} s", flush=True)
 
 
-def _task(system, *, controls, duration, ends, objective, path, design, periodic, nodes, t0) -> Task:
+def task_of(
+    system: AbstractSystem,
+    *,
+    controls: Any,
+    duration: Any,
+    ends: tuple[Any, Any],
+    objective: tuple[Any, Any],
+    path: Any = None,
+    design: Any = None,
+    periodic: bool = False,
+    nodes: tuple[Any, Any],
+    t0: Any = 0.0,
+) -> Task:
+    """The checked task of the arguments of `plan`."""
     check_kind("plan: system", system, AbstractSystem, "a compiled scene", "use scene.compile()")
     intervals, interpolation = nodes
     chosen, control_bounds = checked_controls(system, controls, interpolation)
@@ -142,13 +172,6 @@ def _task(system, *, controls, duration, ends, objective, path, design, periodic
         for where, given in zip(("start", "end"), ends, strict=True)
     )
     running, final = objective
-    if running is None and final is None:
-        raise ValueError(f"plan: there is nothing to minimise; give {_OBJECTIVES}.")
-    if any(
-        not (given is None or given == word or callable(given))
-        for given, word in ((running, "effort"), (final, "time"))
-    ):
-        raise ValueError(f"plan: give {_OBJECTIVES}; got {running!r} and {final!r}.")
     shares = checked_shares(intervals)
     return Task(
         system=system,

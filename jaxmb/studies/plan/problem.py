@@ -74,7 +74,7 @@ class Problem:
     of_variables: sparse.csr_array
     row_low: np.ndarray
     row_high: np.ndarray
-    names: Sequence[str] = ()
+    names: list[str]
 
     @functools.cached_property
     def _last(self) -> list[Evaluated]:

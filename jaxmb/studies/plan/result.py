@@ -178,9 +178,8 @@ class Plan(Printed):
                 raise ValueError("Plan.objective_of runs outside of JAX: it cannot be used under jit or vmap.")
             solution, system = self.solution, with_parameters(self.solution.transcription.task.system, values)
             task = dataclasses.replace(solution.transcription.task, system=system)
-            other = Plan.of(
-                solved(task, solution.found, self.method, _LIMIT, self.tol, lambda _: None), self.method, self.tol
-            )
+            (again,) = solved([task], [solution.found], self.method, _LIMIT, self.tol, lambda _: None)
+            other = Plan.of(again, self.method, self.tol)
             if not other.success:
                 raise RuntimeError(f"Plan.objective_of: the plan for {dict(values)!r} {other.message}.")
             return other

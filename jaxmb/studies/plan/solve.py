@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +11,12 @@ from .guess import Guess
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
 from .task import Task
-from .transcription import Transcription
+from .transcription import Program, Transcription
 
 # The most rounds; the most steps of an interval; charts beyond this quality are replaced.
 _ROUNDS, _MOST_STEPS, _WORN = 40, 256, 3.0
+# The smallest error of an interval's end that is asked for.
+_LEAST_ERROR = 1e-10
 # The factor by which a round may have more steps than the last: far from a motion, errors are no measure.
 _FURTHER = 4
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
@@ -34,8 +36,9 @@ class Iteration(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """The end of the rounds: the last `transcription`, the method's `answer` in it, the `found` states and controls, the
-    log, and the largest error of an interval's end, relative to typical changes.
+    """A phase at the end of the rounds: its last `transcription`, the method's `answer` in it, the `found` states and
+    controls, the log, and the largest error of an interval's end, relative to typical changes; whether it is the only
+    phase.
     """
 
     transcription: Transcription
@@ -43,46 +46,64 @@ class Solution:
     found: Guess
     iterations: tuple[Iteration, ...]
     error: float
+    alone: bool
 
 
 def solved(
-    task: Task, guess: Guess, method: str | None, limit: int, tol: float, told: Callable[[Iteration], None]
-) -> Solution:
-    """The optimum near a guess.
+    tasks: Sequence[Task],
+    guesses: Sequence[Guess],
+    method: str | None,
+    limit: int,
+    tol: float,
+    told: Callable[[Iteration], None],
+) -> list[Solution]:
+    """The optimum near a guess, of each phase.
 
     **Raises:** `ValueError` if a segment fails with the guess, or if conditions depend on each other.
     """
-    begin, steps, scales, answer = time.perf_counter(), 1, None, None
+    begin, steps, scales, answer = time.perf_counter(), [1] * len(tasks), None, None
     log: list[Iteration] = []
     for number in range(_ROUNDS):
-        transcription = Transcription.of(task, guess, steps, scales)
-        steps, _ = _enough_steps(
-            transcription, transcription.start, steps, tol, _MOST_STEPS if scales is None else steps
-        )
-        at = transcription.problem.at(transcription.start)
+        program = Program.of(tasks, guesses, steps, scales)
+        most = [_MOST_STEPS] * len(tasks) if scales is None else steps
+        steps, _ = _enough_steps(program, program.start, steps, tol, most)
         if scales is None:
-            _check_start(transcription, at)
-            _check_ends(transcription, at)
-            scales = _control_scales(transcription, at)
-            transcription = Transcription.of(task, guess, steps, scales)
+            program.problem.at(program.start)
+            _check_start(program)
+            for part in program.parts:
+                _check_ends(part)
+            each = zip(program.parts, program.intervals(), strict=True)
+            scales = [_control_scales(part, at) for part, at in each]
+            program = Program.of(tasks, guesses, steps, scales)
 
-        def watched(objective: float, violation: float, transcription=transcription) -> bool:
+        def watched(objective: float, violation: float, program: Program = program) -> bool:
             log.append(Iteration(len(log) + 1, objective, violation, time.perf_counter() - begin))
             told(log[-1])
-            return transcription.quality() <= _WORN or len(log) == 1
+            return program.quality() <= _WORN or len(log) == 1
 
-        problem, left = transcription.problem, max(limit - len(log), 1)
+        problem, left = program.problem, max(limit - len(log), 1)
         chosen = chosen_method(method, problem.scale.size)
-        answer = minimise(problem, transcription.start, answer, chosen, left, tol, watched)
+        answer = minimise(problem, program.start, answer, chosen, left, tol, watched)
         problem.at(answer.z)
-        worn, before, last = transcription.quality(), steps, guess
-        guess = transcription.read(answer.z)
-        steps, error = _enough_steps(transcription, answer.z, steps, tol, _FURTHER * steps)
-        lost = not all(np.all(np.isfinite(x)) for x in (guess.states.q, guess.states.u))
+        worn, before, last = program.quality(), steps, guesses
+        guesses = [part.read(z) for part, z in zip(program.parts, program.variables(answer.z), strict=True)]
+        steps, errors = _enough_steps(program, answer.z, steps, tol, [_FURTHER * count for count in steps])
+        lost = not all(np.all(np.isfinite(x)) for guess in guesses for x in (guess.states.q, guess.states.u))
         is_last = answer.interrupted or len(log) >= limit or lost or number == _ROUNDS - 1
         if is_last or (steps == before and worn <= _WORN):
-            return Solution(transcription, answer, last if lost else guess, tuple(log), error)
-    raise AssertionError
+            break
+    return _each_phase(program, answer, last if lost else guesses, tuple(log), errors)
+
+
+def _each_phase(program, answer, guesses, log, errors):
+    zs, of_bounds = program.variables(answer.z), program.variables(answer.of_bounds)
+    multipliers, alone = program.rows(answer.multipliers), len(guesses) == 1
+    return [
+        Solution(part, answer._replace(z=z, multipliers=own, of_bounds=bounds), guess, log, error, alone)
+        for part, z, own, bounds, guess, error in zip(
+            program.parts, zs, multipliers, of_bounds, guesses, errors, strict=True
+        )
+    ]
 
 
 def arcs_of(task: Task, found: Guess) -> tuple[int, ...]:
@@ -105,69 +126,73 @@ def arcs_of(task: Task, found: Guess) -> tuple[int, ...]:
 
 
 def _enough_steps(
-    transcription: Transcription, z: np.ndarray, steps: int, tol: float, most: int = _MOST_STEPS
-) -> tuple[int, float]:
-    """The number of steps in an interval that makes the errors of its end small, and the largest error then, relative
-    to typical changes, by comparison with twice as many; `most` at most.
+    program: Program, z: np.ndarray, steps: Sequence[int], tol: float, most: Sequence[int]
+) -> tuple[list[int], list[float]]:
+    """The numbers of steps in an interval that make the errors of its end small, and the largest errors then, relative
+    to typical changes, by comparison with twice as many; `most` at most. One of each for each phase.
     """
-    term, nodes = transcription.problem.terms[0], transcription.nodes
+    pairs = [
+        _enough(part, own, *numbers, tol)
+        for part, own, *numbers in zip(program.parts, program.variables(z), steps, most, strict=True)
+    ]
+    return [count for count, _ in pairs], [error for _, error in pairs]
+
+
+def _enough(part: Transcription, z: np.ndarray, steps: int, most: int, tol: float) -> tuple[int, float]:
+    term, nodes = part.problem.terms[0], part.nodes
     inputs, indices = term.at(z), nodes.charts[1][1:]
-    coarse, error = None, np.inf
+    coarse, error = term.block.linearised(inputs, steps)[0], np.inf
     while steps <= most:
         fine = term.block.linearised(inputs, 2 * steps)[0]
-        coarse = term.block.linearised(inputs, steps)[0] if coarse is None else coarse
         differences = np.take_along_axis(fine - coarse, indices, 1) / nodes.scales[1:]
         error = float(np.max(np.abs(differences))) if np.all(np.isfinite(differences)) else np.inf
-        if error <= max(tol, 1e-10):
+        if error <= max(tol, _LEAST_ERROR):
             break
         steps, coarse = 2 * steps, fine
     term.block.steps = min(steps, most)
     return term.block.steps, error
 
 
-def _check_start(transcription: Transcription, at: Evaluated) -> None:
-    if at.finite:
+def _check_start(program: Program) -> None:
+    last = program.problem.last
+    if last is not None and last.finite:
         return
-    bad = [
-        not np.all(np.isfinite(np.concatenate([y, jacobian.reshape(-1)])))
-        for y, jacobian in zip(at.outputs[0], at.jacobians[0], strict=True)
-    ]
-    if any(bad):
-        k = int(np.argmax(bad))
-        ts = transcription.read(transcription.start).ts
-        raise ValueError(
-            f"plan: interval {k}, from t = {ts[k]:.4g} to {ts[k + 1]:.4g} s, cannot be integrated with the guess: the "
-            "mechanism locks up on the way, a spring is stiff, or a force is not finite. Take more intervals, or a "
-            "guess= nearer to a motion."
-        )
+    for part, at in zip(program.parts, program.intervals(), strict=True):
+        numbers = np.concatenate([at.outputs[0], at.jacobians[0].reshape(len(at.outputs[0]), -1)], axis=1)
+        bad = ~np.all(np.isfinite(numbers), axis=1)
+        if bad.any():
+            k, ts = int(np.argmax(bad)), part.read(part.start).ts
+            raise ValueError(
+                f"plan: interval {k}, from t = {ts[k]:.4g} to {ts[k + 1]:.4g} s, cannot be integrated with the guess: "
+                "the mechanism locks up on the way, a spring is stiff, or a force is not finite. Take more intervals, "
+                "or a guess= nearer to a motion."
+            )
     raise ValueError("plan: a bound along the way, an end or the objective is not finite with the guess.")
 
 
-def _check_ends(transcription: Transcription, at: Evaluated) -> None:
+def _check_ends(part: Transcription) -> None:
     """Refuse equations at an end that depend on each other."""
-    problem = transcription.problem
-    jacobian = None
+    problem = part.problem
     for where in ("start", "end"):
-        rows = transcription.rows_of.get(where, np.zeros(0, int))
+        rows = part.rows_of.get(where, np.zeros(0, int))
         equal = rows[problem.row_low[rows - 1] == problem.row_high[rows - 1]]
         if equal.size:
-            jacobian = problem.jacobian(at) if jacobian is None else jacobian
-            own = jacobian[equal].toarray() * problem.scale
+            own = problem.jacobian(problem.at(part.start))[equal].toarray() * problem.scale
             if np.linalg.matrix_rank(own, tol=1e-8) < equal.size:
                 names = ", ".join(problem.names[k - 1].partition(" at node")[0] for k in equal)
                 raise ValueError(
                     f"plan: the conditions of the {where} depend on each other: {names}. The machine has "
-                    f"{transcription.places.x.shape[1]} independent coordinates and rates; leave the others out."
+                    f"{part.places.x.shape[1]} independent coordinates and rates there; leave the others out."
                 )
 
 
-def _control_scales(transcription: Transcription, at: Evaluated) -> list[np.ndarray]:
+def _control_scales(part: Transcription, at: Evaluated) -> list[np.ndarray]:
     """Changes of controls that change the end of their interval as much as typical changes, over all intervals."""
-    task, nodes, block = transcription.task, transcription.nodes, transcription.problem.terms[0].block
+    task, nodes, term = part.task, part.nodes, part.problem.terms[0]
     indices = nodes.charts[1][1:]
     jacobian = np.take_along_axis(at.jacobians[0], indices[:, :, None], 1) / nodes.scales[1:, :, None]
-    effect = np.zeros(transcription.problem.terms[0].inputs.shape[0] // task.intervals)
-    effect[list(block.active)] = np.abs(jacobian).max(axis=(0, 1))
+    effect = np.zeros(term.inputs.shape[0] // task.intervals)
+    effect[list(term.block.active)] = np.abs(jacobian).max(axis=(0, 1))
     begin, out = nodes.coordinates.shape[1] + 2, []
     for control in task.controls:
         own = effect[begin : begin + control.size * control.course.local].reshape(control.course.local, -1)[0]

@@ -53,6 +53,15 @@ class Limits:
         return np.where(size > 0, size, 1.0)
 
 
+class Named(NamedTuple):
+    """Quantities with these `names`, a function of the instant."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, at: Reading) -> list[Any]:
+        return [at[name] for name in self.names]
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """A plan's problem.

@@ -22,8 +22,8 @@ from ...manifold import Chart
 from ...system import AbstractSystem
 from .guess import Guess
 from .lanes import AbstractLane, Arrival, Block, Look, Model, in_lanes
-from .problem import Problem, Term
-from .task import Limits, Task
+from .problem import Evaluated, Problem, Term
+from .task import Limits, Named, Task
 
 # Bounds of the lengths of moving arcs, relative to the guess.
 _SHORTEST, _LONGEST = 0.05, 5.0
@@ -130,19 +130,14 @@ class Transcription:
         steps: int,
         scales: Sequence[np.ndarray] | None = None,
         nodes: Nodes | None = None,
+        before: "Transcription | None" = None,
     ) -> "Transcription":
         """**Arguments:** `steps` of each interval; `scales` of controls without bounds; `nodes`, default charts at the
-        guess.
+        guess; `before`: the phase before, whose last node is the first.
         """
         model = Model(task.system, task.controls, task.design)
         nodes = nodes_at(model.designed(jnp.asarray(guess.design)), guess.ts, guess.states) if nodes is None else nodes
-        return _Transcriber(task, guess, nodes, model).transcribed(steps, scales)
-
-    def quality(self) -> float:
-        """The largest quality of the charts of the intervals at the last point; infinite where a state is lost."""
-        last = self.problem.last
-        quality = np.inf if last is None else float(np.max(last.outputs[0][:, -2]))
-        return quality if np.isfinite(quality) else np.inf
+        return _Transcriber(task, guess, nodes, model).transcribed(steps, scales, before)
 
     def names_at(self, node: int) -> tuple[str, ...]:
         """The names of a node's coordinates and rates."""
@@ -168,6 +163,89 @@ def _times(task: Task, z: np.ndarray, places: Places) -> np.ndarray:
     return task.t0 + (task.passed @ z[places.times] if task.timed else task.shares * task.duration[0])
 
 
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """Phases as one program: the last node of each is the first node of the next.
+
+    **Fields:** `parts`, the phases; the `problem`.
+    """
+
+    parts: tuple[Transcription, ...]
+    problem: Problem
+
+    @classmethod
+    def of(cls, tasks: Sequence[Task], guesses: Sequence[Guess], steps: Sequence[int], scales: Any) -> "Program":
+        """**Arguments:** of `Transcription.of`, for each phase; `scales` None for all."""
+        parts: list[Transcription] = []
+        for k, task in enumerate(tasks):
+            before = parts[-1] if parts else None
+            own = None if scales is None else scales[k]
+            parts.append(Transcription.of(task, guesses[k], steps[k], own, before=before))
+        return cls(tuple(parts), parts[0].problem if len(parts) == 1 else _joined(parts))
+
+    @property
+    def start(self) -> np.ndarray:
+        """The variables of the guess."""
+        return np.concatenate([part.start for part in self.parts])
+
+    def variables(self, z: np.ndarray) -> list[np.ndarray]:
+        """The variables of each phase."""
+        return np.split(z, np.cumsum([part.places.size for part in self.parts])[:-1])
+
+    def rows(self, rows: np.ndarray) -> list[np.ndarray]:
+        """The rows after the first, of each phase."""
+        return np.split(rows, np.cumsum([part.problem.row_low.size for part in self.parts])[:-1])
+
+    def intervals(self) -> list[Evaluated]:
+        """The intervals of each phase at the last point: terms of one."""
+        last, first, out = self.problem.last, 0, []
+        for part in self.parts:
+            if last is not None:
+                out.append(Evaluated(last.z, *(x[first : first + 1] for x in last[1:4]), last.rows))
+            first += len(part.problem.terms)
+        return out
+
+    def quality(self) -> float:
+        """The largest quality of the charts of intervals at the last point; infinite where a state is lost."""
+        quality = max((float(np.max(at.outputs[0][:, -2])) for at in self.intervals()), default=np.inf)
+        return quality if np.isfinite(quality) else np.inf
+
+
+def _joined(parts: Sequence[Transcription]) -> Problem:
+    problems = [part.problem for part in parts]
+    begins = np.cumsum([0, *(problem.scale.size for problem in problems)])
+    rows = np.cumsum([1, *(problem.row_low.size for problem in problems)])
+    shape = int(rows[-1]), int(begins[-1])
+
+    def whole(matrices):
+        first = sparse.hstack([matrix[:1] for matrix in matrices])
+        return sparse.csr_array(sparse.vstack([first, sparse.block_diag([matrix[1:] for matrix in matrices])]))
+
+    links = _Entries()
+    for k in range(1, len(parts)):
+        before = parts[k - 1]
+        row = parts[k].rows_of["link"] + rows[k] - 1
+        links.add(row, before.places.x[-1] + begins[k - 1], -1.0 / before.nodes.scales[-1])
+    terms = []
+    for problem, begin in zip(problems, begins[:-1], strict=True):
+        for term in problem.terms:
+            entries = sparse.coo_array(term.inputs)
+            inputs = (entries.data, (entries.row, entries.col + begin))
+            wide = sparse.csr_array(inputs, shape=(entries.shape[0], shape[1]))
+            terms.append(Term(term.block, wide, term.offset, term.outputs))
+    return Problem(
+        scale=np.concatenate([problem.scale for problem in problems]),
+        low=np.concatenate([problem.low for problem in problems]),
+        high=np.concatenate([problem.high for problem in problems]),
+        terms=terms,
+        of_outputs=whole([problem.of_outputs for problem in problems]),
+        of_variables=sparse.csr_array(whole([problem.of_variables for problem in problems]) + links.matrix(shape)),
+        row_low=np.concatenate([problem.row_low for problem in problems]),
+        row_high=np.concatenate([problem.row_high for problem in problems]),
+        names=[name for problem in problems for name in problem.names],
+    )
+
+
 class _Transcriber:
     """Makes a `Transcription`."""
 
@@ -179,7 +257,7 @@ class _Transcriber:
         self.low, self.high, self.names = [np.zeros(0)], [np.zeros(0)], []
         self.outputs, self.rows_of = 0, {}
 
-    def transcribed(self, steps: int, control_scales: Any) -> Transcription:
+    def transcribed(self, steps: int, control_scales: Any, before: Transcription | None) -> Transcription:
         task, places, nodes = self.task, self.places, self.nodes
         start, scale, low, high = self._variables(control_scales)
         self._join(self._arrival(steps))
@@ -199,6 +277,12 @@ class _Transcriber:
             self.of_variables.add(row, places.times)
         if task.periodic:
             self._close()
+        if before is not None:
+            # The coordinates of the phase before are subtracted where phases are joined.
+            scales, names = before.nodes.scales[-1], before.names_at(-1)
+            first = self._look(Named(names), [0], len(names))
+            rows = self._rows("link", [f"joint {name}" for name in names], np.zeros(len(names)), np.zeros(len(names)))
+            self.of_outputs.add(rows, first + np.arange(len(names)), 1.0 / scales)
         shape = 1 + sum(x.size for x in self.low), self.outputs
         problem = Problem(
             scale=scale,
