@@ -44,8 +44,9 @@ def evaluate(system: AbstractSystem, state: State, names: str | Sequence[str], *
     - `system`, and a `state` on its constraints, as from `assemble`, `equilibrium` or `motion.end`.
     - `names`: one name or several.
         - Quantities, as `Trajectory.quantity` takes them: coordinates of joints, tendons and ropes with their rates and
-            accelerations; coordinates of bodies with their rates, `"bar.x"`, `"bar.angle_rate"`; `"pin.force"` and `"pin.moment"` of joints; motions of bodies and frames; internal states.
+            accelerations; `"pin.force"` and `"pin.moment"` of joints; motions of bodies and frames; internal states.
             `system.quantities()` lists them.
+        - Coordinates of bodies with their rates, `"bar.x"`, `"bar.angle_rate"`.
         - `"energy"`, `"kinetic_energy"` and `"potential_energy"` [J].
         - Names of force elements: the wrenches on their bodies, as in `Trajectory.forces`.
     - `t`: the time [s], for functions of time.

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._arguments import bounds_of
-from ..._jaxpr_digest import Digest, digest_of
 from ..._traced_functions import traced_by_jax
 from ...parts.names import unknown
 from ...system.quantities import component_names
@@ -74,25 +73,6 @@ def linearised(program: Program, z: Float[Array, "n"]):
 def rows_of_batch(program: Program, z: Float[Array, "starts n"]) -> Float[Array, "starts rows"]:
     """Rows of several vectors at once."""
     return batch(lambda z: program.rows(z)[0])(z)
-
-
-@dataclasses.dataclass(frozen=True)
-class Told:
-    """A function that compares equal to others with the same program: the values that it reads may change between
-    calls.
-    """
-
-    function: Callable[..., Any] = dataclasses.field(compare=False)
-    digest: Digest
-
-    def __call__(self, values: Mapping[str, Array]) -> Any:
-        return self.function(values)
-
-
-def told_apart(function: Callable[..., Any], space: Space) -> Told:
-    """A function of named parameters, compared by its present program."""
-    traced = jax.make_jaxpr(lambda z: function(space(z)))(jnp.zeros(space.size))
-    return Told(function, digest_of(traced, rules=False))
 
 
 @dataclasses.dataclass(frozen=True)

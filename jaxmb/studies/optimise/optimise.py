@@ -18,8 +18,9 @@ from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
 from ...system.quantities import component_names
+from ..told import told_apart
 from .constrained import Balance, balance_at, slsqp
-from .evaluation import Limits, Program, chosen_objective, limits, output_shapes, told_apart, with_derivatives
+from .evaluation import Limits, Program, chosen_objective, limits, output_shapes, with_derivatives
 from .space import Space, space
 from .starts import starting_points
 from .trials import HOLDS, Iteration, Trial, Trials, evaluate
@@ -266,7 +267,7 @@ def optimise(
     objective = chosen_objective(objective, shapes, constraints)
     limited = limits(constraints, shapes)
     _check(method, limited, starts, max_iterations, tol)
-    program = Program(told_apart(function, where), where, (objective, *limited.names), False)
+    program = Program(told_apart(function, where, jnp.zeros(where.size)), where, (objective, *limited.names), False)
     program = with_derivatives(program, 1 + len(limited.components))
     first = evaluate(program, np.zeros(where.size))
     points, spent = starting_points(program, limited, first, shapes, starts, seed, max_iterations)

@@ -115,12 +115,12 @@ class Piece(AbstractSignal):
     """A control on one interval: a polynomial of the share `(t − start) / length` of the interval."""
 
     powers: list[Array]
-    start: Scalar
-    length: Scalar
+    start: Any
+    length: Any
     is_continuous: bool = eqx.field(static=True)
 
     def __call__(self, t):
-        share: Any = (t - self.start) / self.length
+        share = (t - self.start) / self.length
         value = self.powers[-1]
         for power in self.powers[-2::-1]:
             value = value * share + power

@@ -91,9 +91,7 @@ def _controls(task, named, motion, ts):
     return tuple(out)
 
 
-def _straight(
-    task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None
-) -> State:
+def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None) -> State:
     """Coordinates by name along the way, or straight from the start to the end; on the constraints at some times, one
     after the other, and between them nearly straight.
     """
@@ -127,7 +125,7 @@ def _straight(
     between = lambda y: np.stack([np.interp(ts, times, column) for column in y.T], axis=1)
     q, z = between(several.q), None if several.z is None else between(several.z)
     slopes = np.gradient(q, ts, axis=0)
-    states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
+    states = _near(system, ts, q, z, slopes)
     return _with_ends(states, start, task.end if isinstance(task.end, State) else None)
 
 
@@ -199,10 +197,14 @@ def _replaced(values: np.ndarray, k: int, value: Any) -> np.ndarray:
     return values
 
 
+def _near(system: AbstractSystem, ts: np.ndarray, q: Any, z: Any, slopes: np.ndarray) -> State:
+    """The nearest states on the constraints, with velocities for which coordinates have nearly these slopes."""
+    rest: Any = np.zeros((len(ts), system.nu))
+    return in_lanes(_on_constraints, system, ts, State(q, rest, z), slopes)
+
+
 @jitted
 def _on_constraints(system, ts, states, slopes):
-    """The nearest states on the constraints, with velocities for which coordinates have nearly these slopes."""
-
     def of_one(t, state, slope):
         at = Instant.of(system, t, state)
         for _ in range(_CORRECTIONS if system.position_rows else 0):
@@ -224,7 +226,8 @@ def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> S
         raise ValueError("plan: a motion as the guess needs at least two saved times: simulate(…, saveat=times).")
     if np.shape(ys.q)[1:] != (system.nq,):
         raise ValueError(
-            f"plan: the guess is a motion of another system, with {np.shape(ys.q)[1]} coordinates instead of {system.nq}."
+            f"plan: the guess is a motion of another system, with {np.shape(ys.q)[1]} coordinates instead of "
+            f"{system.nq}."
         )
     places = times[0] + (times[-1] - times[0]) * task.shares
     between = lambda y: np.stack([np.interp(places, times, column) for column in np.asarray(y).T], axis=1)
@@ -233,7 +236,7 @@ def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> S
     slopes = (
         between(in_lanes(_rates, system, times, State(ys.q, ys.u, ys.z))) * (times[-1] - times[0]) / (ts[-1] - ts[0])
     )
-    states = in_lanes(_on_constraints, system, ts, State(q, np.zeros((len(ts), system.nu)), z), slopes)
+    states = _near(system, ts, q, z, slopes)
     return _with_ends(states, *(x if isinstance(x, State) else None for x in (task.start, task.end)))
 
 

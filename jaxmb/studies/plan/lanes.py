@@ -36,8 +36,8 @@ def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     matrix = np.zeros((stages, stages))
     for k, row in enumerate(tableau.a_lower):
         matrix[k + 1, : len(row)] = row
-    used = np.flatnonzero(np.any(matrix != 0, axis=0) | (np.asarray(tableau.b_sol) != 0))
-    return np.append(0.0, tableau.c)[used], matrix[np.ix_(used, used)], np.asarray(tableau.b_sol)[used]
+    used: Any = np.flatnonzero(np.any(matrix != 0, axis=0) | (np.asarray(tableau.b_sol) != 0))
+    return np.append(0.0, tableau.c)[used], matrix[used][:, used], np.asarray(tableau.b_sol)[used]
 
 
 class Control(NamedTuple):
@@ -122,7 +122,7 @@ class Arrival(AbstractLane):
             t = t0 + step * (count + times[number])
             inner = y + step * (matrix[number] @ slopes)
             state, rates = here.moving(t, inner[:n], near)
-            cost = jnp.zeros(()) if self.running is None else self._cost(system, state, t, pieces, design)
+            cost = self._cost(system, state, t, pieces, design)
             slopes = slopes.at[number].set(jnp.append(rates, cost))
             y = jnp.where(number == times.size - 1, y + step * (weights @ slopes), y)
             return y, lax.stop_gradient(state), slopes
@@ -131,10 +131,12 @@ class Arrival(AbstractLane):
         y, near, _ = lax.fori_loop(0, steps * times.size, stage, start)
         end = here.state(t0 + h, y[:n], near)
         quality = lax.stop_gradient(here.quality(t0, here.state(t0, x)))
-        outputs = jnp.concatenate([*_plain(end)[: 2 if end.z is None else 3], quality[None], y[n:]])
+        outputs = jnp.concatenate([*jax.tree.leaves(_plain(end)), quality[None], y[n:]])
         return outputs * jnp.where(quality <= _BORDER, 1.0, jnp.nan)
 
     def _cost(self, system, state, t, pieces, design):
+        if self.running is None:
+            return jnp.zeros(())
         given = self.model.given(t, {name: piece(t) for name, piece in pieces.items()}, design)
         return jnp.asarray(self.running(Reading(system, state, t, given)))
 
@@ -211,8 +213,8 @@ class Block:
     def curvature(
         self, inputs: np.ndarray, first: np.ndarray, weights: np.ndarray, scales: np.ndarray, central: bool = False
     ) -> np.ndarray:
-        """The second derivatives of each lane's weighted sum of outputs, by differences of `first`, its derivatives."""
-        lanes, active = len(inputs), np.array(self.active, int)
+        """The second derivatives of each lane's weighted sum of outputs, by differences of `first` derivatives."""
+        active = np.array(self.active, int)
         sides = np.array((1.0, -1.0) if central else (1.0,))
         # Inputs of a lane that depend on no variable have no scale.
         aside = _ASIDE * np.where(scales > 0, scales, 1.0)[:, active]

@@ -4,15 +4,19 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from ..._arguments import check_kind, real_array, whole_number
+from ..._traced_functions import traced_by_jax
 from ..._types import State
 from ...parts.names import names_arguments
 from ...simulate.arguments import checked_state
 from ...system import AbstractSystem
 from ...system.design import Bounds
+from ..evaluate import Reading
+from ..told import told_apart
 from .guess import first_guess
 from .result import Plan
 from .solve import Iteration, arcs_of, solved
@@ -70,7 +74,7 @@ def plan(
         without bounds; parameters as of `with_inputs`.
     - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
     - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
-        high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. The others are free.
+        high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. Others are free.
     - `running`: a function of the instant by names, `lambda at: at["motor.force"] ** 2`; or `"effort"`, the sum of the
         squares of the controls.
     - `final`: a function of the end, `lambda at: -at["tip.position"][0]`; or `"time"`, the duration.
@@ -142,6 +146,17 @@ def check_minimised(objectives: Sequence[tuple[Any, Any]]) -> None:
                 raise ValueError(f"plan: give {_OBJECTIVES}; got {given!r}.")
 
 
+def _told(system: AbstractSystem, function: Any, others: Any) -> Any:
+    """A user's function of the instant, compared by its program; words as they are."""
+    if not callable(function):
+        return function
+    numbers, rest = eqx.partition(system, eqx.is_array)
+    state = State(jnp.zeros(system.nq), jnp.zeros(system.nu), jnp.zeros(system.nz) if system.nz else None)
+    seen = lambda numbers, state, t, given: Reading(eqx.combine(numbers, rest), state, t, given)
+    with traced_by_jax("the objective of plan", "the instant"):
+        return told_apart(function, seen, numbers, state, jnp.zeros(()), others)
+
+
 def _print(iteration: Iteration) -> None:
     number, objective, violation, seconds = iteration
     print(f"{number:4d}  objective {objective:16.9g}  violation {violation:8.1e}  {seconds:7.1f} s", flush=True)
@@ -171,7 +186,7 @@ def task_of(
         checked_state(system, given) if isinstance(given, State) else checked_limits(system, where, given, others)
         for where, given in zip(("start", "end"), ends, strict=True)
     )
-    running, final = objective
+    running, final = (_told(system, given, others) for given in objective)
     shares = checked_shares(intervals)
     return Task(
         system=system,

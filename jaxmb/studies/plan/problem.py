@@ -1,9 +1,8 @@
-"""A nonlinear program whose functions are computed in lanes: objective, constraints, and their exact sparse derivatives.
+"""A nonlinear program whose functions are computed in lanes: objective, constraints, and exact sparse derivatives.
 
-With variables z, lane k has the inputs `v = E z + e`, outputs `y(v)` and their Jacobian J. Objective and constraints are
-the rows of `R y + L z`. Their derivatives are sums over lanes of products of R, J and E, and second derivatives are sums
-of products of E with the lanes' second derivatives; a sparse matrix of ones and factors makes both from the numbers of
-the lanes.
+With variables z, lane k has the inputs `v = E z + e`, outputs `y(v)` and their Jacobian J. Objective and constraints
+are the rows of `R y + L z`. Their derivatives are sums over lanes of products of R, J and E, and second derivatives are
+sums of products of E with the lanes' second derivatives. One sparse matrix makes each from the numbers of the lanes.
 """
 
 import dataclasses
@@ -33,18 +32,19 @@ class Term:
 
     def at(self, z: np.ndarray) -> np.ndarray:
         """The inputs, shape (lanes, inputs)."""
-        return (self.inputs @ z + self.offset).reshape(self.lanes, -1)
+        product: Any = self.inputs @ z
+        return (product + self.offset).reshape(self.lanes, -1)
 
     @functools.cached_property
     def active(self) -> sparse.csr_array:
         """The rows of `inputs` for active inputs."""
-        width = self.inputs.shape[0] // self.lanes
+        width = self.offset.size // self.lanes
         rows = np.arange(self.lanes)[:, None] * width + np.array(self.block.active, int)
         return sparse.csr_array(self.inputs[rows.reshape(-1)])
 
 
 class Evaluated(NamedTuple):
-    """All functions at one point: inputs, outputs and Jacobians of all lanes; `rows`: the objective, and constraints."""
+    """All functions at a point: inputs, outputs and Jacobians of all lanes; `rows`: the objective, and constraints."""
 
     z: np.ndarray
     inputs: list[np.ndarray]
@@ -99,7 +99,7 @@ class Problem:
 
     @functools.cached_property
     def _slopes(self) -> tuple[np.ndarray, np.ndarray, sparse.csr_array, np.ndarray]:
-        """Places of the derivatives' entries, the matrix that makes them from all Jacobians, and their constant part."""
+        """Places of the derivatives' entries, the matrix that makes them from Jacobians, and their constant part."""
         rows, columns, values, sources = [], [], [], []
         first = place = 0
         for term in self.terms:

@@ -25,6 +25,8 @@ from .task import Limits
 
 # Saved times in each interval, and the tolerance of the simulation that checks a plan.
 _SAVED, _CHECK = 8, 1e-10
+# The distance from a bound, relative to typical changes, at which a value is at the bound.
+_AT_BOUND = 1e-6
 # The largest number of iterations when a plan is found again for other parameters.
 _LIMIT = 300
 
@@ -38,8 +40,8 @@ class Plan(Printed):
     - `objective`; `duration` [s]; `ts` [s]: the times of the nodes, and `states` there, stacked along axis 0.
     - `controls`: functions of time by name, `Series` for `simulate(…, inputs=plan.controls)`.
     - `parameters`: the optimised parameters by name; `system`: the system with them.
-    - `prices`: by how much the objective grows per unit by which a value given at an end grows, or a bound along the way
-        (the extreme value over the nodes), by name; also of a fixed start or end `State`, by coordinate.
+    - `prices`: the growth of the objective per unit by which a value given at an end grows, or a bound along the way
+        (the extreme over the nodes), by name; of a fixed start or end `State` by coordinate.
     - `active`: names of controls, parameters and times that are at a bound somewhere, and of bounds along the way.
     - `iterations`: the log of the method. `success`: whether the method converged; `message`: why it ended.
     - `integration_error`: the largest error of an interval's end, relative to typical changes.
@@ -254,7 +256,7 @@ def _prices(solution: Solution) -> dict[str, np.ndarray]:
 def _active(solution: Solution) -> tuple[str, ...]:
     transcription, z = solution.transcription, solution.answer.z
     problem, task, places = transcription.problem, transcription.task, transcription.places
-    at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= 1e-6 * problem.scale
+    at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale
     out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
     begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
     out += [
@@ -266,12 +268,7 @@ def _active(solution: Solution) -> tuple[str, ...]:
     if task.path.names:
         rows = transcription.rows_of["path"] - 1
         values = problem.at(z).rows[1:][rows]
-        near = np.minimum(np.abs(values - problem.row_low[rows]), np.abs(values - problem.row_high[rows])) <= 1e-6
-        out += [
-            name
-            for name, is_near in zip(
-                task.path.components, near.reshape(-1, len(task.path.components)).any(axis=0), strict=True
-            )
-            if is_near
-        ]
+        near = np.minimum(np.abs(values - problem.row_low[rows]), np.abs(values - problem.row_high[rows])) <= _AT_BOUND
+        components = task.path.components
+        out += [components[k] for k in np.flatnonzero(near.reshape(-1, len(components)).any(axis=0))]
     return tuple(out)

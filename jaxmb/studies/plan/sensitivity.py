@@ -1,7 +1,8 @@
-"""Derivatives of an optimum by parameters of the system: of the objective by the envelope theorem, of controls and states
-by the linear system of the optimality conditions.
+"""Derivatives of an optimum by parameters of the system: of the objective by the envelope theorem, of controls and
+states by the linear system of the optimality conditions.
 
-Source: A. V. Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", Academic Press, 1983.
+Source: A. V. Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", Academic Press,
+1983.
 """
 
 import dataclasses

@@ -63,7 +63,7 @@ def solved(
     """
     begin, steps, scales, answer = time.perf_counter(), [1] * len(tasks), None, None
     log: list[Iteration] = []
-    for number in range(_ROUNDS):
+    for rounds_left in reversed(range(_ROUNDS)):
         program = Program.of(tasks, guesses, steps, scales)
         most = [_MOST_STEPS] * len(tasks) if scales is None else steps
         steps, _ = _enough_steps(program, program.start, steps, tol, most)
@@ -85,14 +85,15 @@ def solved(
         chosen = chosen_method(method, problem.scale.size)
         answer = minimise(problem, program.start, answer, chosen, left, tol, watched)
         problem.at(answer.z)
-        worn, before, last = program.quality(), steps, guesses
-        guesses = [part.read(z) for part, z in zip(program.parts, program.variables(answer.z), strict=True)]
+        worn, before = program.quality(), steps
+        found = [part.read(z) for part, z in zip(program.parts, program.variables(answer.z), strict=True)]
         steps, errors = _enough_steps(program, answer.z, steps, tol, [_FURTHER * count for count in steps])
-        lost = not all(np.all(np.isfinite(x)) for guess in guesses for x in (guess.states.q, guess.states.u))
-        is_last = answer.interrupted or len(log) >= limit or lost or number == _ROUNDS - 1
+        lost = not all(np.all(np.isfinite(x)) for guess in found for x in (guess.states.q, guess.states.u))
+        guesses = guesses if lost else found
+        is_last = answer.interrupted or len(log) >= limit or lost or not rounds_left
         if is_last or (steps == before and worn <= _WORN):
-            break
-    return _each_phase(program, answer, last if lost else guesses, tuple(log), errors)
+            return _each_phase(program, answer, guesses, tuple(log), errors)
+    raise AssertionError("unreachable")
 
 
 def _each_phase(program, answer, guesses, log, errors):
@@ -131,10 +132,8 @@ def _enough_steps(
     """The numbers of steps in an interval that make the errors of its end small, and the largest errors then, relative
     to typical changes, by comparison with twice as many; `most` at most. One of each for each phase.
     """
-    pairs = [
-        _enough(part, own, *numbers, tol)
-        for part, own, *numbers in zip(program.parts, program.variables(z), steps, most, strict=True)
-    ]
+    each = zip(program.parts, program.variables(z), steps, most, strict=True)
+    pairs = [_enough(part, own, count, limit, tol) for part, own, count, limit in each]
     return [count for count, _ in pairs], [error for _, error in pairs]
 
 
@@ -191,7 +190,7 @@ def _control_scales(part: Transcription, at: Evaluated) -> list[np.ndarray]:
     task, nodes, term = part.task, part.nodes, part.problem.terms[0]
     indices = nodes.charts[1][1:]
     jacobian = np.take_along_axis(at.jacobians[0], indices[:, :, None], 1) / nodes.scales[1:, :, None]
-    effect = np.zeros(term.inputs.shape[0] // task.intervals)
+    effect = np.zeros(term.offset.size // task.intervals)
     effect[list(term.block.active)] = np.abs(jacobian).max(axis=(0, 1))
     begin, out = nodes.coordinates.shape[1] + 2, []
     for control in task.controls:

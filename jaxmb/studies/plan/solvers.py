@@ -182,7 +182,7 @@ def _slsqp(problem: Problem, z: np.ndarray, limit: int, tol: float, told: Told) 
             value,
             last,
             jac=lambda w: slopes(w)[0],
-            bounds=optimize.Bounds(problem.low / scale, problem.high / scale),
+            bounds=np.stack([problem.low / scale, problem.high / scale], axis=1),
             constraints=kinds,
             callback=after,
             options={"maxiter": limit, "ftol": tol},

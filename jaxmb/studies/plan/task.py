@@ -68,8 +68,9 @@ class Task:
 
     **Fields:** the `system`; `controls` with `control_bounds`, one pair for each; `design`: names and shapes, with
     `design_bounds`; `t0`; `duration`: its bounds; `shares`: the nodes as shares of the duration, 0 to 1; `arcs`: the
-    first and the last node, and between them nodes that move, with the others evenly between them; `start` and `end`: a state, or limits; `path`: limits; `running` and `final`: functions
-    of the instant, or None; `of_time`: the weight of the duration in the objective; `periodic`.
+    first and the last node, and between them nodes that move, with the others evenly between them; `start` and `end`:
+    a state, or limits; `path`: limits; `running` and `final`: functions of the instant, or None; `of_time`: the weight
+    of the duration in the objective; `periodic`.
     """
 
     system: AbstractSystem
@@ -195,7 +196,7 @@ def checked_limits(system: AbstractSystem, where: str, given: Any, others: Mappi
 
 
 def _shape(system, name, others, where):
-    state = State(*(jnp.zeros(n) for n in (system.nq, system.nu)), jnp.zeros(system.nz) if system.nz else None)
+    state = State(jnp.zeros(system.nq), jnp.zeros(system.nu), jnp.zeros(system.nz) if system.nz else None)
     reading = Reading(system, state, 0.0, dict(others))
     if name not in reading.names:
         raise unknown("quantity", name, reading.names, f"plan: {where}")

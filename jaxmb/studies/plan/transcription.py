@@ -83,7 +83,9 @@ class _Entries:
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """The places of variables: `x`, shape (nodes, coordinates); `times`: the lengths of arcs, or nothing; `controls`, one array of shape (numbers, components) for each; `design`."""
+    """The places of variables: `x`, shape (nodes, coordinates); `times`: the lengths of arcs, or nothing; `controls`,
+    one array of shape (numbers, components) for each; `design`.
+    """
 
     x: np.ndarray
     times: np.ndarray
@@ -201,7 +203,8 @@ class Program:
         last, first, out = self.problem.last, 0, []
         for part in self.parts:
             if last is not None:
-                out.append(Evaluated(last.z, *(x[first : first + 1] for x in last[1:4]), last.rows))
+                inputs, outputs, jacobians = (x[first : first + 1] for x in last[1:4])
+                out.append(Evaluated(last.z, inputs, outputs, jacobians, last.rows))
             first += len(part.problem.terms)
         return out
 
@@ -231,7 +234,7 @@ def _joined(parts: Sequence[Transcription]) -> Problem:
         for term in problem.terms:
             entries = sparse.coo_array(term.inputs)
             inputs = (entries.data, (entries.row, entries.col + begin))
-            wide = sparse.csr_array(inputs, shape=(entries.shape[0], shape[1]))
+            wide = sparse.csr_array(inputs, shape=(term.offset.size, shape[1]))
             terms.append(Term(term.block, wide, term.offset, term.outputs))
     return Problem(
         scale=np.concatenate([problem.scale for problem in problems]),
