@@ -51,10 +51,8 @@ def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
     ts = task.t0 + duration * task.shares
     system, design = _designed(task, named, motion)
     controls = _controls(task, named, motion, ts)
-    first = {
-        c.name: jnp.asarray(c.course.series(ts, x.reshape(-1, *c.shape))(ts[0]))
-        for c, x in zip(task.controls, controls, strict=True)
-    }
+    # The first number of each course is the value at the first node.
+    first = {c.name: x[0].reshape(c.shape) for c, x in zip(task.controls, controls, strict=True)}
     system = with_parameters(system, first)
     states = _along(task, system, motion, ts) if motion is not None else _straight(task, system, named, ts, begin)
     return Guess(states, ts, controls, design)
@@ -175,11 +173,9 @@ def _given(
     system: AbstractSystem, limits: Limits, known: Iterable[str], state: State, t: Scalar
 ) -> dict[str, np.ndarray]:
     """The values of quantities with known names; within bounds, those next to the values of a state."""
-    begins, known = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in limits.shapes)]), set(known)
-    out = {}
-    for name, shape, a, b in zip(limits.names, limits.shapes, begins[:-1], begins[1:], strict=True):
+    out, known = {}, set(known)
+    for name, (low, high) in limits.by_name().items():
         if name in known:
-            low, high = limits.low[a:b].reshape(shape), limits.high[a:b].reshape(shape)
             out[name] = low if np.all(low == high) else np.clip(evaluate(system, state, name, t=t), low, high)
     return out
 

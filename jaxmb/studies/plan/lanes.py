@@ -114,12 +114,12 @@ class Arrival(AbstractLane):
         system = with_inputs(model.designed(design), pieces) if pieces else model.designed(design)
         here = Chart(system, *chart)
         times, matrix, weights = (jnp.asarray(array, x.dtype) for array in _tableau())
-        step = h / steps
+        step = h / steps.astype(h.dtype)
 
         def stage(k, carry):
             y, near, slopes = carry
             number, count = k % times.size, k // times.size
-            t = t0 + step * (count + times[number])
+            t = t0 + step * (count.astype(h.dtype) + times[number])
             inner = y + step * (matrix[number] @ slopes)
             state, rates = here.moving(t, inner[:n], near)
             cost = self._cost(system, state, t, pieces, design)

@@ -3,12 +3,13 @@
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._pictured import picture
 from ..._printed import Printed
 from ..._types import State
 from ...linalg.arrays import is_traced
@@ -22,6 +23,9 @@ from .lanes import Model
 from .sensitivity import Sensitivity, derivatives, sensitivities
 from .solve import Iteration, Solution, solved
 from .task import Limits
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Saved times in each interval, and the tolerance of the simulation that checks a plan.
 _SAVED, _CHECK = 8, 1e-10
@@ -102,9 +106,7 @@ class Plan(Printed):
 
     @functools.cached_property
     def trajectory(self) -> Trajectory:
-        """One simulation from the start through all intervals with the found controls, with an estimate of its error
-        in `trajectory.error`.
-        """
+        """One simulation from the start through all intervals with the found controls."""
         start = jax.tree.map(lambda y: y[0], self.states)
         times = np.interp(
             np.linspace(0, len(self.ts) - 1, _SAVED * (len(self.ts) - 1) + 1), range(len(self.ts)), self.ts
@@ -116,7 +118,6 @@ class Plan(Printed):
             t1=self.ts[-1],
             saveat=times,
             rtol=_CHECK,
-            error=True,
             throw=False,
         )
 
@@ -140,10 +141,30 @@ class Plan(Printed):
         limits = self.solution.transcription.task.path
         if not limits.names:
             return {}
-        given = {name: jax.vmap(series)(self.trajectory.ts) for name, series in self.controls.items()}
-        values = np.asarray(_along(self.system, limits, self.trajectory.ts, self.trajectory.ys, given))
+        values = np.asarray(_along(self.system, limits, self.trajectory.ts, self.trajectory.ys, self.along))
         excess = np.maximum(np.maximum(limits.low - values, values - limits.high), 0.0)
         return dict(zip(limits.components, map(float, np.max(excess, axis=0)), strict=True))
+
+    @functools.cached_property
+    def along(self) -> dict[str, np.ndarray]:
+        """The controls by name at the times of `trajectory`."""
+        return {name: np.asarray(jax.vmap(series)(self.trajectory.ts)) for name, series in self.controls.items()}
+
+    @property
+    def bounds(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The bounds of controls and of quantities along the way, by name; infinite where there is none."""
+        task = self.solution.transcription.task
+        controls = zip((control.name for control in task.controls), task.control_bounds, strict=True)
+        return {**dict(controls), **task.path.by_name()}
+
+    def plot(self, *names: str) -> "Figure":
+        """Plot the controls with their bounds over time, and further quantities of the motion by name.
+
+        **Returns:** a matplotlib `Figure`.
+
+        **Raises:** `ValueError` for an unknown name; `ImportError` without matplotlib.
+        """
+        return picture("plan.plot", self, names)
 
     def derivatives(self, *names: str) -> dict[str, np.ndarray]:
         """The derivatives of the objective by parameters of the system, or by a fixed `"duration"`, at the optimum.

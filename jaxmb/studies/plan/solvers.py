@@ -109,9 +109,13 @@ def _ipopt(problem: Problem, z: np.ndarray, before: Answer | None, limit: int, t
         return float(value[0])
 
     def after(mode, number, value, violation, of_dual, mu, *_):
-        nonlocal barrier
+        nonlocal barrier, interrupted
         barrier = mu
-        return told(value, violation) and not interrupted
+        try:
+            return told(value, violation) and not interrupted
+        except KeyboardInterrupt:
+            interrupted = True
+            return False
 
     options = {"print_level": 0, "sb": "yes", "tol": tol, "constr_viol_tol": tol, "max_iter": limit}
     options |= {"bound_relax_factor": 0.0, "mu_init": _BARRIER if before is None else max(before.barrier, tol)}

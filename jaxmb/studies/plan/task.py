@@ -44,6 +44,12 @@ class Limits:
         each = zip(self.names, self.shapes, strict=True)
         return [component for name, shape in each for component in component_names(name, shape)]
 
+    def by_name(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The bounds of each quantity."""
+        begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self.shapes)])
+        each = zip(self.names, self.shapes, begins[:-1], begins[1:], strict=True)
+        return {name: (self.low[a:b].reshape(shape), self.high[a:b].reshape(shape)) for name, shape, a, b in each}
+
     @property
     def sizes(self) -> np.ndarray:
         """Units of violations: the distance of the bounds, or the larger bound, or 1."""
@@ -139,7 +145,7 @@ def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> 
         if name not in existing:
             raise unknown("control", name, existing, "plan")
         value = existing[name]
-        numbers = jnp.zeros((course.local, *value.shape), value.dtype)
+        numbers: Any = np.zeros((course.local, *value.shape), value.dtype)
         driven = with_inputs(system, {name: Piece(course.powers(numbers, 1.0), 0.0, 1.0, True)})
         if driven.parameter_table.signals[name][1] and not course.smooth:
             raise ValueError(

@@ -1,0 +1,232 @@
+"""Optimal control of a four-bar linkage against exact optima: values, prices, derivatives, phases, messages."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmb as mb
+from jaxmb import planar
+
+MOST_PROGRAMS = 80
+
+# Exact optima of the linkage without gravity, turned by half a turn from rest to rest. Work and inertia alone determine
+# the least time, T = ∫ √(M / 2 τ Δθ) dθ, with the switch where the works of both torques are equal; Pontryagin's
+# equations in one coordinate, solved by `scipy.integrate.solve_bvp` at 1e-8, the least effort in two seconds.
+LEAST_TIME, SWITCH, BY_LENGTH = 2.6639894054, 1.5702019682, -0.1036951
+LEAST_EFFORT, FIRST_TORQUE, LAST_TORQUE = 18.987353952, 5.336762213, -5.336762214
+REST, TURNED = ({"crank.angle": angle, "crank.angle_rate": 0.0} for angle in (1.57, 1.57 + np.pi))
+FREE, BOUNDED = {"motor.force": None}, {"motor.force": (-2.0, 2.0)}
+
+
+def linkage(length=2.0):
+    """Uniform bars of 1 kg, with a motor at the ground pivot of the crank."""
+    bar = lambda name, size, position, angle: planar.Body(
+        name, mass=1.0, inertia=planar.rod(1.0, size), position=position, angle=angle
+    )
+    bodies = [
+        bar("crank", 1.0, (0.0, 0.5), 1.57),
+        bar("coupler", length, (1.0, 1.4), 0.4),
+        bar("rocker", 1.8, (2.2, 0.9), 1.8),
+    ]
+    pins = [
+        planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+        planar.Revolute("B", "crank", "coupler", point_a=(0.5, 0.0), point_b=(-0.5 * length, 0.0)),
+        planar.Revolute("C", "coupler", "rocker", point_a=(0.5 * length, 0.0), point_b=(0.9, 0.0)),
+        planar.Revolute("D", "ground", "rocker", point_a=(2.5, 0.0), point_b=(-0.9, 0.0)),
+    ]
+    return mb.Scene(bodies, joints=pins, forces=[mb.JointForce("motor", "A.angle", force=0.0)]).compile()
+
+
+@pytest.fixture(scope="module")
+def system():
+    return linkage()
+
+
+@pytest.fixture(scope="module")
+def planned(system):
+    """Plans by their options, each made once."""
+
+    @functools.cache
+    def plan(kind, intervals, interpolation="linear"):
+        options = {"start": REST, "end": TURNED, "intervals": intervals, "interpolation": interpolation}
+        if kind == "time":
+            return mb.plan(system, controls=BOUNDED, duration=(1.0, 5.0), final="time", moving=True, **options)
+        return mb.plan(system, controls=FREE, duration=2.0, running="effort", **options)
+
+    return plan
+
+
+def test_plan_of_least_effort_converges_to_the_exact_optimum_as_the_fourth_power_of_the_interval(planned):
+    plans = [planned("effort", intervals) for intervals in (8, 16, 32)]
+    errors = np.array([plan.objective for plan in plans]) - LEAST_EFFORT
+    assert all(plan.success for plan in plans) and np.all(errors > 0) and errors[-1] < 3e-6
+    np.testing.assert_array_less(11.0, errors[:-1] / errors[1:])
+    torques = np.asarray(plans[-1].controls["motor.force"].values)[[0, -1]]
+    np.testing.assert_allclose(torques, [FIRST_TORQUE, LAST_TORQUE], atol=0.01)
+
+
+def test_plan_simulated_in_one_run_arrives_at_its_end_on_the_constraints(planned):
+    plan = planned("effort", 8)
+    assert plan.arrival < 1e-7 and plan.integration_error < 1e-8
+    np.testing.assert_allclose(plan.trajectory["crank"].angle[-1], 1.57 + np.pi, rtol=0, atol=1e-7)
+    assert np.max(np.abs(plan.trajectory.constraint_violation.position)) < 1e-12
+    assert "motor.force" in str(plan) and "converged" in str(plan) and plan.active == ()
+
+
+def test_plan_of_least_time_switches_at_the_exact_time(planned):
+    plan = planned("time", 6, "held")
+    torque = np.asarray(plan.controls["motor.force"].values)[:-1]
+    switch = plan.ts[int(np.argmax(torque < 0))]
+    np.testing.assert_allclose([plan.objective, switch], [LEAST_TIME, SWITCH], rtol=1e-6)
+    np.testing.assert_allclose(np.abs(torque), 2.0, rtol=1e-6)
+    assert plan.active == ("motor.force",) and plan.duration == plan.objective
+
+
+def test_derivative_of_the_least_time_by_a_length_follows_from_multipliers(planned):
+    """The exact derivative, at a constant mass of the coupler."""
+    slopes = planned("time", 6, "held").derivatives("B.point_b", "C.point_a", "coupler.inertia")
+    of_inertia = jax.grad(lambda length: planar.rod(1.0, length))(2.0)
+    by_length = -0.5 * slopes["B.point_b"][0] + 0.5 * slopes["C.point_a"][0] + slopes["coupler.inertia"] * of_inertia
+    np.testing.assert_allclose(by_length, BY_LENGTH, rtol=1e-5)
+
+
+def test_derivatives_of_an_optimum_are_differences_of_optima(system, planned):
+    plan, aside = planned("effort", 8), 1e-3
+    heavier, lighter = (
+        mb.plan(
+            mb.with_parameters(system, {"coupler.mass": 1.0 + change}),
+            controls=FREE,
+            duration=2.0,
+            running="effort",
+            start=REST,
+            end=TURNED,
+            intervals=8,
+            guess=plan,
+        )
+        for change in (aside, -aside)
+    )
+    sensitivity = plan.sensitivities("coupler.mass")["coupler.mass"]
+    difference = (heavier.objective - lighter.objective) / (2 * aside)
+    np.testing.assert_allclose(sensitivity.objective, difference, rtol=1e-6)
+    np.testing.assert_allclose(plan.derivatives("coupler.mass")["coupler.mass"], difference, rtol=1e-6)
+    torques = [np.asarray(p.controls["motor.force"].values) for p in (heavier, lighter)]
+    by_mass = sensitivity.controls["motor.force"]
+    np.testing.assert_allclose(by_mass, (torques[0] - torques[1]) / (2 * aside), rtol=0, atol=1e-5)
+    slope = jax.grad(lambda mass: plan.objective_of({"coupler.mass": mass}))(1.0)
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_prices_of_ends_and_of_the_duration_are_differences_of_optima(system, planned):
+    plan, aside = planned("effort", 8), 1e-3
+    again = functools.partial(mb.plan, system, controls=FREE, running="effort", start=REST, intervals=8, guess=plan)
+    further, nearer = (
+        again(duration=2.0, end={**TURNED, "crank.angle": 1.57 + np.pi + change}).objective
+        for change in (aside, -aside)
+    )
+    np.testing.assert_allclose(plan.prices["end crank.angle"], (further - nearer) / (2 * aside), rtol=1e-5)
+    later, sooner = (again(duration=2.0 + change, end=TURNED).objective for change in (aside, -aside))
+    np.testing.assert_allclose(plan.derivatives("duration")["duration"], (later - sooner) / (2 * aside), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_bounds_along_the_way_hold_at_nodes_and_their_violation_between_is_told(system):
+    slow = {"crank.angle_rate": (None, 1.8)}
+    options = {"duration": (1.0, 5.0), "final": "time", "start": REST, "end": TURNED, "path": slow}
+    plan = mb.plan(system, controls=BOUNDED, intervals=16, **options)
+    rates = np.asarray(plan.states.u)[:, 2]
+    assert plan.success and np.max(rates) <= 1.8 + 1e-7 and plan.objective > LEAST_TIME
+    assert "crank.angle_rate" in plan.active and 0 < plan.violation["crank.angle_rate"] < 0.1
+
+
+@pytest.mark.slow
+def test_parameters_are_optimised_with_controls(system, planned):
+    """Less mass needs less torque: the coupler's mass is at its lower bound, and the optimum is of the lighter machine."""
+    options = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 8}
+    plan = mb.plan(system, design={"coupler.mass": (0.5, 2.0)}, **options)
+    light = planned("effort", 8).objective_of({"coupler.mass": 0.5})
+    np.testing.assert_allclose(plan.parameters["coupler.mass"], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(plan.objective, light, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_phases_of_one_system_are_one_plan_and_a_load_changes_the_second(system, planned):
+    half = lambda system: mb.Phase(system, controls=FREE, duration=1.0, running="effort", intervals=4)
+    whole = mb.plan_phases([half(system), half(system)], start=REST, end=TURNED)
+    # The torque may jump between phases.
+    assert whole.success and planned("effort", 8).objective - 1e-3 < whole.objective < planned("effort", 8).objective
+    loaded = mb.plan_phases(
+        [half(system), half(mb.with_parameters(system, {"coupler.mass": 2.0}))], start=REST, end=TURNED
+    )
+    first, second = loaded.phases
+    assert loaded.success and loaded.objective > whole.objective
+    np.testing.assert_allclose(first.states.u[-1], second.states.u[0], rtol=0, atol=1e-8)
+    assert max(first.arrival, second.arrival) < 1e-6
+
+
+def test_slsqp_finds_the_plan_of_ipopt(system, planned):
+    options = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 8}
+    plan = mb.plan(system, method="slsqp", tol=1e-10, **options)
+    np.testing.assert_allclose(plan.objective, planned("effort", 8).objective, rtol=1e-7)
+    np.testing.assert_allclose(
+        plan.prices["end crank.angle"], planned("effort", 8).prices["end crank.angle"], rtol=1e-4
+    )
+
+
+@pytest.mark.slow
+def test_plan_by_cubic_controls_meets_the_exact_optimum_with_few_intervals(planned):
+    plan = planned("effort", 16, "cubic")
+    np.testing.assert_allclose(plan.objective, LEAST_EFFORT, rtol=1e-8)
+    values, slopes = plan.controls["motor.force"].values, plan.controls["motor.force"].slopes
+    np.testing.assert_allclose([values[0], values[-1]], [FIRST_TORQUE, LAST_TORQUE], atol=1e-3)
+    assert slopes.shape == values.shape
+
+
+GOOD = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 4}
+REFUSED = [
+    ({"controls": {"motor.forc": None}}, "Unknown control 'motor.forc'; did you mean 'motor.force'?"),
+    ({"controls": {}}, "controls must be bounds by the names of parameters"),
+    ({"controls": {"motor.force": (2.0, -2.0)}}, "must be (low, high) with low < high"),
+    ({"controls": {"crank.mass": None}}, "crank.mass"),
+    ({"duration": 0.0}, "duration must be a positive number of seconds"),
+    ({"duration": (3.0, 1.0)}, "duration"),
+    ({"running": None}, "there is nothing to minimise"),
+    ({"running": "time"}, "got 'time'"),
+    ({"interpolation": "square"}, "interpolation must be 'held', 'linear' or 'cubic'"),
+    ({"intervals": 0}, "intervals must be an integer of at least 1"),
+    ({"intervals": [0.0, 0.7, 0.5, 1.0]}, "ascending shares from 0 to 1"),
+    ({"end": {"crank.angel": 1.0}}, "Unknown quantity 'crank.angel'; did you mean 'crank.angle'?"),
+    ({"end": {"crank.angle": 9.0, "rocker.angle": 9.0}}, "contradicts the constraints"),
+    ({"start": {**REST, "rocker.angle_rate": 0.0}}, "conditions of the start depend on each other"),
+    ({"path": {"motor.power": (0.0, 1.0)}}, "Unknown quantity 'motor.power'"),
+    ({"design": {"motor.force": (0.0, 1.0)}}, "is a control and a designed parameter"),
+    ({"design": {"crank.mass": (2.0, 3.0)}}, "not within its bounds"),
+    ({"method": "newton"}, "method must be 'ipopt' or 'slsqp'"),
+    ({"guess": {"crank.angl": 1.0}}, "Unknown coordinate 'crank.angl'"),
+    ({"tol": 0.0}, "tol must be positive"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), REFUSED, ids=[words[:30] for _, words in REFUSED])
+def test_plan_refuses(system, change, words):
+    with pytest.raises((ValueError, KeyError)) as error:
+        mb.plan(system, **{**GOOD, **change})
+    assert words in str(error.value)
+
+
+def test_ctrl_c_returns_the_plan_so_far(system, monkeypatch):
+    lines = []
+
+    def interrupt(text, **options):
+        del options
+        lines.append(text)
+        if len(lines) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("builtins.print", interrupt)
+    plan = mb.plan(system, verbose=True, **GOOD)
+    assert not plan.success and plan.message == "interrupted" and len(lines) == 2
+    assert np.all(np.isfinite(plan.states.q)) and jnp.shape(plan.states.q) == (5, 9)
