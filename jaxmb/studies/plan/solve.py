@@ -17,6 +17,8 @@ from .transcription import Program, Transcription
 _ROUNDS, _MOST_STEPS, _WORN = 40, 256, 3.0
 # The smallest error of an interval's end that is asked for.
 _LEAST_ERROR = 1e-10
+# The error of an interval's end, relative to typical changes, that is small enough for a guess.
+_FIRST_ERROR = 1e-3
 # The factor by which a round may have more steps than the last: far from a motion, errors are no measure.
 _FURTHER = 4
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
@@ -65,9 +67,9 @@ def solved(
     log: list[Iteration] = []
     for rounds_left in reversed(range(_ROUNDS)):
         program = Program.of(tasks, guesses, steps, scales)
-        most = [_MOST_STEPS] * len(tasks) if scales is None else steps
-        steps, _ = _enough_steps(program, program.start, steps, tol, most)
         if scales is None:
+            # A guess is no motion: its errors need not be small yet.
+            steps, _ = _enough_steps(program, program.start, steps, _FIRST_ERROR, [_MOST_STEPS] * len(tasks))
             program.problem.at(program.start)
             _check_start(program)
             for part in program.parts:
