@@ -54,6 +54,13 @@ def by_hand(angle, rate, mass=MASS, t=0.0):
     }
 
 
+def test_coordinates_of_bodies_and_their_rates_at_a_state(system):
+    values = mb.evaluate(system, at(ANGLE, RATE), ["bar.x", "bar.y_rate", "bar.angle_rate", "twin.position"])
+    known = [LENGTH * np.cos(ANGLE), LENGTH * np.cos(ANGLE) * RATE, RATE, [LENGTH, 3.0]]
+    for value, expected in zip(values.values(), known, strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-14)
+
+
 def test_quantities_at_a_state_are_those_of_closed_forms(system):
     state = at(ANGLE, RATE)
     for t in (0.0, 0.5):

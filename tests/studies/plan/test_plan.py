@@ -1,6 +1,7 @@
 """Optimal control of a four-bar linkage against exact optima: values, prices, derivatives, phases, messages."""
 
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,9 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar
+from jaxmb.studies.plan.courses import COURSES
+from jaxmb.studies.plan.guess import Guess
+from jaxmb.studies.plan.solve import arcs_of
 
 MOST_PROGRAMS = 80
 
@@ -144,7 +148,7 @@ def test_bounds_along_the_way_hold_at_nodes_and_their_violation_between_is_told(
 
 @pytest.mark.slow
 def test_parameters_are_optimised_with_controls(system, planned):
-    """Less mass needs less torque: the coupler's mass is at its lower bound, and the optimum is of the lighter machine."""
+    """Less mass needs less torque: the coupler's mass is at its lower bound."""
     options = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 8}
     plan = mb.plan(system, design={"coupler.mass": (0.5, 2.0)}, **options)
     light = planned("effort", 8).objective_of({"coupler.mass": 0.5})
@@ -230,3 +234,27 @@ def test_ctrl_c_returns_the_plan_so_far(system, monkeypatch):
     plan = mb.plan(system, verbose=True, **GOOD)
     assert not plan.success and plan.message == "interrupted" and len(lines) == 2
     assert np.all(np.isfinite(plan.states.q)) and jnp.shape(plan.states.q) == (5, 9)
+
+
+@pytest.mark.parametrize("kind", COURSES)
+def test_courses_are_their_series_on_each_interval(kind):
+    course, ts = COURSES[kind], np.array([0.0, 0.5, 1.5, 2.0])
+    numbers = np.random.default_rng(0).standard_normal((course.count(3), 2))
+    series = course.series(ts, numbers)
+    places, shares = course.places(3), np.array([0.0, 0.3, 0.9])
+    for k in range(3):
+        h = ts[k + 1] - ts[k]
+        powers = np.stack(course.powers(numbers[places[k]], h))
+        values = np.stack([np.sum(share ** np.arange(len(powers))[:, None] * powers, axis=0) for share in shares])
+        np.testing.assert_allclose(values, [series(ts[k] + share * h) for share in shares], rtol=0, atol=1e-12)
+    nodes = numbers[course.values(3)]
+    np.testing.assert_allclose(nodes[:3], [series(t) for t in ts[:3]], rtol=0, atol=1e-12)
+    assert course.numbers(nodes, nodes).shape == numbers.shape
+
+
+def test_arcs_begin_where_a_held_control_switches():
+    """At a jump, and at the larger one of two jumps beside a value between the bounds; not where it drifts."""
+    values = np.array([2.0, 2.0, 1.5, -2.0, -2.0, -1.95, -1.9, 2.0, 2.0])
+    found = Guess(None, np.arange(10.0), (values[:, None],), np.zeros(0))
+    task = types.SimpleNamespace(intervals=9)
+    assert arcs_of(task, found) == (0, 3, 7, 9)
