@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from .. import mechanisms
 from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
-from . import doctor, help, run, sweep
+from . import doctor, help, run
 
 # Removed commands, each with its replacement.
 _ELSEWHERE = {
     "report": "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python; mb.report.stress_test is the other",
+    "sweep": "jaxmb.sweep(function, cases, FOLDER, processes=2) in a Python file; running the file again resumes it",
     "reference": "python -m sphinx -c tests/pages . FOLDER in a checkout of jaxmb",
 }
 
@@ -62,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, sweep, doctor, help):
+    for command in (run, doctor, help):
         command.add_to(commands)
     return out
 
