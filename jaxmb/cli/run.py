@@ -14,8 +14,7 @@ from ..mechanisms import Mechanism
 from ..simulate import simulate
 from ..trajectory import Trajectory
 from .folders import check_folder, check_picture, made_folder, show_motion, write_figures
-from .options import add_parameters
-from .subject import mechanism_of
+from .subject import add_parameters, mechanism_of
 
 # Saved times.
 _TIMES = 401
