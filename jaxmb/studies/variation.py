@@ -74,15 +74,19 @@ class Variation:
             if name not in known:
                 raise unknown("parameter, input, coordinate or rate", name, known, "explore")
         turned = [name for name in (*bounds, *fix) if name in known and known[name].kind == "coordinate"]
-        turned = list(dict.fromkeys([*turned, *_independent(system, start, turned)]))
+        wanted, turned = turned, _independent(system, start, list(dict.fromkeys(turned)))
+        for name in wanted:
+            if name not in turned:
+                raise ValueError(f"explore: {name!r} follows from {', '.join(turned)}; leave it out.")
         if rates is None:
             # Joints start as fast as in the given state.
             rates = {name: known[f"{name}_rate"].start for name in turned if f"{name}_rate" in known}
+        rates = {name: value for name, value in rates.items() if not {name, f"{name}_rate"} & bounds.keys()}
         sliders = tuple(
             _bounded(known[name], bounds.get(name), float(system.length)) for name in dict.fromkeys([*bounds, *turned])
         )
         held = {name: value for name, value in fix.items() if name not in turned}
-        return cls(system, start, sliders, held, dict(rates), options)
+        return cls(system, start, sliders, held, rates, options)
 
     def motion(self, values: Mapping[str, float]) -> Trajectory:
         """The motion for values by name, default the first ones; a pose is a motion with one time.
@@ -156,7 +160,7 @@ def _known(system: AbstractSystem, start: State) -> dict[str, Slider]:
                 add("rate", f"{base}_rate", value, named(system, f"{base}_rate").unit)
     for base, index in rates_of(system.rate_names()).items():
         if len(index) == 1 and base not in out:
-            add("rate", base, np.asarray(start.u)[index[0]], "")
+            add("rate", base, np.asarray(start.u)[index[0]], named(system, base).unit)
     return out
 
 

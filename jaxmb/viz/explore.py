@@ -22,8 +22,8 @@ from .motion_nodes import motion as motion_of
 from .solids import COLORS
 
 # The time [s] between two looks at the sliders, saved times of a motion, steps of a slider, and pixels of a notebook's
-# cell and of a plot.
-_TICK, _TIMES, _STEPS, _HEIGHT, _PLOT = 1 / 30, 201, 400, 620, 190
+# cell, and of a plot with its margins.
+_TICK, _TIMES, _STEPS, _HEIGHT, _PLOT, _PADDING = 1 / 30, 201, 400, 620, 190, (14, 8, 0, 0)
 _GREY = "rgb(170, 170, 170)"
 
 
@@ -157,7 +157,8 @@ class Explorer:
 
     def _add_controls(self) -> None:
         gui, ts, sliders = self._server.gui, np.asarray(self.motion.ts), self._variation.sliders
-        gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False, show_share_button=False)
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         self._said = gui.add_markdown("")
         if ts.size > 1:
             self._playing = gui.add_checkbox("play", False)
@@ -174,9 +175,9 @@ class Explorer:
             ]
             title = with_unit(name, named(self._variation.system, name).unit)
             series: Any = ({"label": "t [s]"}, *lines)
-            of_time: Any = {"x": {"time": False}}
             table = self._table(name, self._start)
-            self._plots[name] = gui.add_uplot(table, series, title=title, height=_PLOT, scales=of_time)
+            options: Any = {"title": title, "height": _PLOT, "padding": _PADDING, "scales": {"x": {"time": False}}}
+            self._plots[name] = gui.add_uplot(table, series, **options)
 
     def _table(self, name: str, curves: Mapping[str, Mapping[str, np.ndarray]]) -> tuple[np.ndarray, ...]:
         return (np.asarray(self.motion.ts), *self._start[name].values(), *curves[name].values())
