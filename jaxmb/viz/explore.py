@@ -94,6 +94,12 @@ def curves(motion: Trajectory, names: Sequence[str]) -> dict[str, dict[str, np.n
 class Explorer:
     """A page with sliders, from `explore`; notebooks show it, and `url` is its address on this machine.
 
+    ```python
+    explorer = jaxmb.viz.explore(system, {"bar.mass": (0.5, 4.0)})
+    explorer.set({"bar.mass": 2.0})
+    explorer.close()
+    ```
+
     **Fields:** `motion`: the last that was shown, of the numbers in `values`; `problem`: why there is none for the
     present numbers, or "". A notebook that is exported or read on another machine shows nothing, since its cell needs
     this process.
