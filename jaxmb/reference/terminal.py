@@ -10,7 +10,8 @@ from .topics import Topic, topics
 
 _HOW = (
     "`jaxmb help NAME` explains a name, such as `jaxmb help simulate`, all names of a module, such as `jaxmb help "
-    "planar`, or a topic, such as `jaxmb help tolerances`. All topics and public names:"
+    "planar`, or a topic, such as `jaxmb help tolerances`. Examples go on from the script of `jaxmb help "
+    "getting-started`. All topics and public names:"
 )
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _ITEM = re.compile(r" *(- |\d+\. )")
