@@ -14,7 +14,7 @@ from jax import lax
 from .._arguments import bounds_of
 from .._results import RESULTS
 from .._types import State
-from ..bodies.units import declared_unit, named
+from ..bodies.units import named, parameter_unit
 from ..parts.names import unknown
 from ..simulate import simulate
 from ..states.assembly import assemble
@@ -147,8 +147,7 @@ def _known(system: AbstractSystem, start: State) -> dict[str, Slider]:
     signals = system.parameter_table.signals
     for base, value in parameters(system).items():
         value = signals[base][0](motion.ts[0]) if base in signals else value
-        unit = declared_unit(system, *base.split(".", 1)) if "." in base else ""
-        add("input" if base in signals else "parameter", base, np.asarray(value), unit)
+        add("input" if base in signals else "parameter", base, np.asarray(value), parameter_unit(system, base))
     for base, index in coordinates.items():
         if len(index) == 1 and not base.endswith(".mode"):
             add("coordinate", base, np.asarray(start.q)[index[0]], named(system, base).unit)

@@ -40,7 +40,7 @@ def test_entries_are_not_private():
 def test_topics_hide_no_public_name():
     for topic in topics():
         # Unknown, or of several modules, as `names` is.
-        with pytest.raises(ValueError, match="Unknown name|is the name of"):
+        with pytest.raises(ValueError, match=r"Unknown name|is the name of"):
             find(topic)
 
 

@@ -18,7 +18,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import nbformat
-import numpy as np
 from nbclient import NotebookClient
 from PIL import Image
 
