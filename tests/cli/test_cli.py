@@ -45,11 +45,6 @@ def test_run_of_a_lagrangian_system(capsys, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png"}
 
 
-WRONG = [
-    (["report", "work_precision", "pendulum"], "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python"),
-    (["reference", "site"], "python -m sphinx -c tests/pages . FOLDER"),
-    (["sweep", "study.py"], "jaxmb.sweep(function, cases, FOLDER, processes=2)"),
-]
 WRONG_RUNS = [
     (["pendulm"], "did you mean 'pendulum'"),
     (["pendulum", "--t1", "-1"], "--t1 must be positive"),
@@ -65,9 +60,6 @@ WRONG_RUNS = [
 
 
 def test_wrong_words_are_told(capsys, tmp_path):
-    for words, message in WRONG:
-        assert main(words) == 2
-        assert message in capsys.readouterr().err
     for words, message in WRONG_RUNS:
         assert main(["run", *words, "--out", str(tmp_path)]) == 2
         assert message in (told := capsys.readouterr().err) and told.count("\n") == 1

@@ -11,7 +11,7 @@ from jaxmb.studies.variation import Variation
 from jaxmb.viz import explore
 from jaxmb.viz.explore import curves
 
-MOST_PROGRAMS = 115
+MOST_PROGRAMS = 140
 TS = np.linspace(0.0, 0.5, 6)
 OPTIONS = {"t1": 0.5, "saveat": TS, "rtol": 1e-8}
 GRAVITY = mb.Gravity((0.0, -9.81))

@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike
 from ..._arguments import package_for_tables
 from ..._pictured import picture
 from ..._printed import Printed
-from ...bodies.units import parameter_unit
+from ...bodies.units import named, parameter_unit
 from .density import LogDensity, logdensity
 from .fit import Fit, flat
 from .prediction import HeldOut, Prediction, held_out, predict
@@ -200,11 +200,22 @@ class Identification(Printed, Fit):
     @property
     def _rows(self) -> list[tuple[str, str, str, str, str]]:
         """For each component its name, start, estimate, standard deviation or the reason for its absence, and unit."""
-        unit = functools.partial(parameter_unit, self.problem.system)
         columns = zip(self.components, *map(flat, (self.start, self.parameters, self.deviations)), strict=True)
         return [
-            (name, f"{a:.6g}", f"{b:.6g}", self.reasons.get(name, f"{c:.2g}"), unit(name)) for name, a, b, c in columns
+            (name, f"{a:.6g}", f"{b:.6g}", self.reasons.get(name, f"{c:.2g}"), self._unit(name))
+            for name, a, b, c in columns
         ]
+
+    def _unit(self, name: str) -> str:
+        """The unit of a component of a parameter, a start value or a sensor's bias or delay; "" if it is unknown."""
+        system, base = self.problem.system, name.split("[")[0].rpartition("/")[2].removeprefix("initial.")
+        if base in {**system.coordinate_names(), **system.rate_names()}:
+            return named(system, base).unit
+        channels = {channel.name: channel for trial in self.problem.trials for channel in trial.channels}
+        sensor, _, number = base.rpartition(".")
+        if sensor in channels and number in ("bias", "delay"):
+            return "s" if number == "delay" else named(system, channels[sensor].quantity).unit
+        return parameter_unit(system, base)
 
     def __repr__(self) -> str:
         return f"Identification of {', '.join(self.parameters)}: {self.message}"

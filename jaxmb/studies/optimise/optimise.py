@@ -276,8 +276,8 @@ def optimise(
     runs = [_run(program, limited, z, method, tol, max_iterations) for z in points]
     runs.sort(key=lambda run: run.trials.merit(run.trials.best))
     best = _optimum(first, shapes, runs, spent)
-    named = {} if system is None else {name: parameter_unit(system, name) for name, *_ in best.components}
-    return dataclasses.replace(best, units=named)
+    found = {name: "" if system is None else parameter_unit(system, name) for name, *_ in best.components}
+    return dataclasses.replace(best, units={name: unit for name, unit in found.items() if unit})
 
 
 class _Run(NamedTuple):
