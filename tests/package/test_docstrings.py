@@ -103,6 +103,10 @@ speeds = mb.cases.grid(speed=np.linspace(0.0, 5.0, 3))
 mb.sweep(lambda speed: {"angle": 2.0 * speed}, speeds, "runs.zarr", progress=False)
 """,
 }
+BEFORE["spatial.Body.from_mesh"] = """
+import trimesh
+trimesh.creation.box((100.0, 20.0, 10.0)).export("arm.stl")
+"""
 BEFORE["spatial.MagicFormulaTyre"] = f"""
 import shutil
 shutil.copy({str(TYRE_FILE)!r}, "tyre.tir")
