@@ -11,6 +11,7 @@ from .system.parameters import parameters as parameters, with_parameters as with
 from .system.inputs import with_inputs as with_inputs
 from .system.design import design as design
 from .system.design_variables import Variable as Variable
+from .parts.units import deg as deg, bar as bar, rpm as rpm
 
 ## States and motions
 from ._types import State as State

@@ -86,9 +86,19 @@ def effort(system: Any, name: str) -> tuple[str, str]:
     return _WORD_OF_UNIT.get(unit, field.replace("_", " ") if is_parameter else "force"), unit
 
 
+def parameter_unit(system: Any, name: str) -> str:
+    """The unit of a parameter, of a component of it, or of a design variable; "" if it is unknown."""
+    base = name.split("[")[0]
+    variables = {own: variable.unit for group in system.design for own, variable in group.variables}
+    return variables[base] if base in variables else declared_unit(system, *base.partition(".")[::2])
+
+
 def declared_unit(system: Any, part: str, field: str) -> str:
     """The unit of a number or an internal state of a part, "" if it is unknown."""
     for own in _parts(system, part):
+        # Numbers of a user function have the units that the user gives.
+        if field in (given := dict(getattr(own, "units", ()))):
+            return given[field]
         unit = getattr(declarations(type(own)).get(field.split(".")[0]), "unit", None)
         if isinstance(unit, tuple):
             return _of_coordinate(own, field, unit)
@@ -120,6 +130,7 @@ def _parts(system, name):
     """The parts of a name; several where a joint rubs."""
     if not system.body_names:
         return
+    yield from (weight for weight in system.forces.gravity_part if weight.name == name)
     for group in itertools.chain(system.constraints.groups, system.forces.groups, system.bodies.groups):
         if name in group.group.names:
             yield group.group.part

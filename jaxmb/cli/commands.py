@@ -10,13 +10,7 @@ from collections.abc import Sequence
 from .. import mechanisms
 from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
-from . import doctor, help, run, sweep
-
-# Removed commands, each with its replacement.
-_ELSEWHERE = {
-    "report": "print(mb.report.work_precision(mb.mechanisms.get(NAME))) in Python; mb.report.stress_test is the other",
-    "reference": "python -m sphinx -c tests/pages . FOLDER in a checkout of jaxmb",
-}
+from . import doctor, help, run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,11 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Returns:** the exit code: 0; or, with a message on stderr, 1 if a simulation failed or a file could not be
     written, 2 for an invalid name or value, and 130 after Ctrl-C. Errors in a user's file have their tracebacks.
     """
-    words = sys.argv[1:] if argv is None else list(argv)
-    if words and words[0] in _ELSEWHERE:
-        print(f"jaxmb: `jaxmb {words[0]}` is now: {_ELSEWHERE[words[0]]}.", file=sys.stderr)
-        return 2
-    arguments = parser().parse_args(words)
+    arguments = parser().parse_args(argv)
     _prepare()
     try:
         arguments.command(arguments)
@@ -62,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, sweep, doctor, help):
+    for command in (run, doctor, help):
         command.add_to(commands)
     return out
 

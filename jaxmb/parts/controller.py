@@ -56,6 +56,7 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     - `acts_on`: a coordinate, `"slide.displacement"`, or several.
     - `states`: the internal states, such as an integral, with their initial values; their names are `"pid.integral"`.
     - `parameters`: numbers, or modules as in `Force`, by name; they become parameters of the system, `"pid.gain"`.
+    - `units` of states and parameters by name, `{"integral": "rad s"}`, for figures and tables.
 
     Angles of joints in space are known up to full turns, and jump at half a turn.
     """
@@ -65,6 +66,7 @@ class Controller(AbstractOfJoints, AbstractDynamicForce):
     acts_on: Any = eqx.field(static=True, converter=_names)  # pyright: ignore[reportGeneralTypeIssues]
     states: fields.Numbers = fields.internal_states_by_name()
     parameters: fields.Numbers = fields.numbers()
+    units: Any = eqx.field(static=True, converter=_pairs, default=(), kw_only=True)  # pyright: ignore[reportGeneralTypeIssues]
     # A scene fills in the names of the sources, and the names by which the function returns several forces. In
     # `measures` and `acts_on` the index of a source then replaces its name, so that controllers of different joints are
     # stacked.

@@ -1,7 +1,11 @@
 """Units of numbers, and the power of a length in them."""
 
+import math
 import re
 from typing import TypeAlias
+
+# Other units in SI units: a degree [rad], a bar [Pa], a revolution per minute [rad/s].
+deg, bar, rpm = math.pi / 180, 1e5, math.pi / 30
 
 # The unit of a number; two units, with an angle and with a length, for a number of a coordinate; None if unknown.
 Unit: TypeAlias = str | tuple[str, str] | None

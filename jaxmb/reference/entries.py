@@ -255,35 +255,28 @@ class _AsWritten(str):
 
 def _written(function: Any) -> dict[str, str]:
     """The annotations in the source of a function; none without a source, as in a dataclass."""
-    try:
-        tree = ast.parse(inspect.cleandoc("\n" + inspect.getsource(function))).body[0]
-    except (OSError, TypeError):
-        return {}
+    tree = _source(function)
     if not isinstance(tree, ast.FunctionDef):
         return {}
-    given = [
-        argument
-        for argument in ast.walk(tree.args)
-        if isinstance(argument, ast.arg) and argument.annotation is not None
-    ]
-    annotations = {
-        argument.arg: ast.unparse(argument.annotation) for argument in given if argument.annotation is not None
-    }
-    return annotations | ({} if tree.returns is None else {"return": ast.unparse(tree.returns)})
+    given = {x.arg: x.annotation for x in ast.walk(tree.args) if isinstance(x, ast.arg)} | {"return": tree.returns}
+    return {name: ast.unparse(annotation) for name, annotation in given.items() if annotation is not None}
 
 
 @functools.cache
 def _annotations(cls: type) -> dict[str, str]:
     """The annotations in the source of a class itself, except class variables."""
-    tree = ast.parse(inspect.cleandoc(f"\n{inspect.getsource(cls)}")).body[0]
-    assert isinstance(tree, ast.ClassDef)
-    annotations = {}
-    for node in tree.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            annotation = ast.unparse(node.annotation)
-            if not annotation.startswith(("ClassVar", "AbstractVar")) and not node.target.id.startswith("_"):
-                annotations[node.target.id] = annotation
-    return annotations
+    nodes = [node for node in getattr(_source(cls), "body", ()) if isinstance(node, ast.AnnAssign)]
+    annotations = {ast.unparse(node.target): ast.unparse(node.annotation) for node in nodes}
+    shown = lambda name, kind: not (kind.startswith(("ClassVar", "AbstractVar")) or name.startswith("_"))
+    return {name: kind for name, kind in annotations.items() if shown(name, kind)}
+
+
+def _source(thing: Any) -> ast.stmt | None:
+    """The statement that defines a class or function; None without a source."""
+    try:
+        return ast.parse(inspect.cleandoc("\n" + inspect.getsource(thing))).body[0]
+    except (OSError, TypeError):
+        return None
 
 
 def _of_package(cls: type) -> list[type]:
@@ -349,13 +342,18 @@ def find(name: str) -> Entry:
     head, dot, last = plain.rpartition(".")
     owner = _found(head) if dot else None
     if owner is not None and owner.kind == "class":
-        by_short = {entry.short: entry for entry in (*_fields_of(owner), *_every_member(owner))}
+        of_fields = (Entry(f"{owner.name}.{x}", annotation, owner.thing) for x, annotation in fields(owner).items())
+        # The nearest class comes last, so that its members are kept.
+        of_classes = (member for base in (*reversed(bases(owner)), owner) for member in members(base))
+        by_short = {entry.short: entry for entry in (*of_fields, *of_classes)}
         if last in by_short:
             return by_short[last]
         raise unknown("name", plain, [f"{head}.{short}" for short in by_short])
     if dot:
         raise unknown("name", plain, entries())
-    error, speaking = unknown("name", plain, _shortest_names()), _speaking_of(plain)
+    by_short = _by_short_name()
+    shortest = [entry.short if len(by_short[entry.short]) == 1 else entry.name for entry in entries().values()]
+    error, speaking = unknown("name", plain, [*shortest, *results()]), _speaking_of(plain)
     raise UnknownNameError(f"{error} The word is explained in {', '.join(speaking)}.") if speaking else error
 
 
@@ -383,19 +381,3 @@ def _by_short_name() -> dict[str, list[Entry]]:
     for entry in entries().values():
         groups.setdefault(entry.short, []).append(entry)
     return groups
-
-
-def _shortest_names() -> list[str]:
-    """The shortest names by which entries are found."""
-    by_short = _by_short_name()
-    public = [entry.short if len(by_short[entry.short]) == 1 else entry.name for entry in entries().values()]
-    return [*public, *results()]
-
-
-def _every_member(entry: Entry) -> tuple[Entry, ...]:
-    """All members, those of base classes first, so that a dictionary keeps the nearest."""
-    return tuple(member for base in (*reversed(bases(entry)), entry) for member in members(base))
-
-
-def _fields_of(entry: Entry) -> tuple[Entry, ...]:
-    return tuple(Entry(f"{entry.name}.{name}", annotation, entry.thing) for name, annotation in fields(entry).items())

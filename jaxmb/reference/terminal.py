@@ -10,11 +10,14 @@ from .topics import Topic, topics
 
 _HOW = (
     "`jaxmb help NAME` explains a name, such as `jaxmb help simulate`, all names of a module, such as `jaxmb help "
-    "planar`, or a topic, such as `jaxmb help tolerances`. All topics and public names:"
+    "planar`, or a topic, such as `jaxmb help tolerances`. Examples go on from the script of `jaxmb help "
+    "getting-started`. All topics and public names:"
 )
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
-_FENCE = re.compile(r"^( *)```")
 _ITEM = re.compile(r" *(- |\d+\. )")
+_NEXT_ITEM = re.compile(r"\n(?= *(?:- |\d+\. ))")
+# A piece of code between fences, or the lines up to an empty line or a piece of code.
+_BLOCK = re.compile(r"^ *```.*\n(?P<code>(?:.*\n)*?) *```$|(?:^(?! *```) *\S.*(?:\n|\Z))+", re.M)
 
 
 def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = False) -> str:
@@ -112,47 +115,14 @@ def _hanging(text: str, first: int, other: int, width: int) -> str:
 
 def _filled(text: str, width: int) -> Iterable[tuple[str, bool]]:
     """The filled paragraphs of a docstring, each with whether it is code; code and tables stay as they are."""
-    for block in _blocks(text):
-        first = block[0]
-        if _FENCE.match(first):
-            yield textwrap.indent(textwrap.dedent("\n".join(block[1:-1])), "    "), True
-        elif first.lstrip().startswith("|"):
-            yield "\n".join(block), False
+    for match in _BLOCK.finditer(text):
+        block = match.group().rstrip("\n")
+        if match["code"] is not None:
+            yield textwrap.indent(textwrap.dedent(match["code"]).rstrip("\n"), "    "), True
+        elif block.lstrip().startswith("|"):
+            yield block, False
         else:
-            yield "\n".join(_hanging_item(item, width) for item in _items(block)), False
-
-
-def _blocks(text: str) -> Iterable[list[str]]:
-    """The lines of a text between empty lines; a piece of code stays together."""
-    block, in_code = [], False
-    for line in text.splitlines():
-        if _FENCE.match(line):
-            if block and not in_code:
-                yield block
-                block = []
-            block.append(line)
-            if in_code:
-                yield block
-                block = []
-            in_code = not in_code
-        elif line.strip() or in_code:
-            block.append(line)
-        elif block:
-            yield block
-            block = []
-    if block:
-        yield block
-
-
-def _items(block: list[str]) -> Iterable[list[str]]:
-    """The items of a list, or the paragraph."""
-    item = block[:1]
-    for line in block[1:]:
-        if _ITEM.match(line):
-            yield item
-            item = []
-        item.append(line)
-    yield item
+            yield "\n".join(_hanging_item(item.split("\n"), width) for item in _NEXT_ITEM.split(block)), False
 
 
 def _hanging_item(lines: list[str], width: int) -> str:

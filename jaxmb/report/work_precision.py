@@ -40,7 +40,7 @@ _COLUMNS = {
     "rtol": ".0e",
     "error": ".1e",
     "run [ms]": ".2f",
-    "median": ".2f",
+    "median [ms]": ".2f",
     "compile [s]": ".1f",
     "steps": "d",
     "rejected": "d",

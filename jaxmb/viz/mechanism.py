@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 _FEW = 8
 # Largest number of times in a title.
 _TIMES = 6
+# The least width of a picture, relative to its height, and the other way round.
+_THIN = 0.2
 _EDGE: Color = (40, 40, 40)
 
 
@@ -103,8 +105,12 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
-        (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-        figure.set_figheight(float(np.clip(6.5 * (top - bottom) / (high - low) + 1.0, 2.2, 6.5)))
+        limits = np.array([axes.get_xlim(), axes.get_ylim()])
+        # Labels need room beside a machine in one line.
+        size, middle = np.ptp(limits, axis=1), np.mean(limits, axis=1)
+        half = np.maximum(size, _THIN * size.max()) / 2
+        axes.set(**{name: (x - h, x + h) for name, x, h in zip(("xlim", "ylim"), middle, half, strict=True)})
+        figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
     else:
         axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
         axes.set(zlabel="z [m]", aspect="equal")

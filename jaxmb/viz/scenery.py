@@ -51,11 +51,8 @@ class View:
         right, deep = _across(planar, up)
         n, step = len(motions), 1.15 * extent + 0.1 * size
         columns = _columns(n, abs(step @ right), abs(step @ deep))
-        offsets = [np.zeros(3) for _ in motions]
-        if not overlay:
-            for k in range(n):
-                place = (k % columns) * abs(step @ right) * right + (k // columns) * abs(step @ deep) * deep
-                offsets[k] = place
+        place = lambda k: (k % columns) * abs(step @ right) * right + (k // columns) * abs(step @ deep) * deep
+        offsets = [np.zeros(3) if overlay else place(k) for k in range(n)]
         corners = np.array([single.bounds + offset for single, offset in zip(motions, offsets, strict=True)])
         low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         cell = round_number(float(np.max(extent)) / 12)
@@ -167,15 +164,8 @@ def _wider(low, high, share):
 
 def _distinct(groups):
     """The groups without repetitions of equal arrays."""
-    out = []
-    for group in groups:
-        leaves = jax.tree.leaves(group)
-        same = lambda other, leaves=leaves: all(
-            np.array_equal(a, b) for a, b in zip(leaves, jax.tree.leaves(other), strict=True)
-        )
-        if not any(map(same, out)):
-            out.append(group)
-    return out
+    key = lambda group: tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(group))
+    return list({key(group): group for group in groups}.values())
 
 
 def _surface(name, mesh, position, orientation):

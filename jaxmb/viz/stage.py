@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from viser import SceneApi, ViserServer
 
 # One picture is recorded at a time, since all threads share the console that a recording makes quiet.
-_RECORDS = threading.Lock()
+_RECORDS = threading.RLock()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,33 +45,35 @@ def viser() -> Any:
 
 def page(nodes: Sequence[tuple[Float[np.ndarray, "times"], Sequence[SceneNode]]], camera: "Camera") -> str:
     """A page that plays groups of nodes, each group with the times [s] of its motion, from 0 on."""
-    with _server() as server:
-        scene = server.scene
-        scene.set_up_direction(camera.up)
-        camera.place(server.initial_camera)
-        scene.configure_default_lights(True, cast_shadow=camera.shadows)
-        handles = [
-            (times, node, node.add(scene, **{name: values[0] for name, values in node.varying.items()}))
-            for times, group in nodes
-            for node in group
-        ]
-        recording = server.get_scene_serializer()
-        now = 0.0
-        for time in np.unique(np.concatenate([times for times, _ in nodes])):
-            recording.insert_sleep(float(time) - now)
-            now = float(time)
-            for times, node, handle in handles:
-                k = int(np.searchsorted(times, time))
-                if 0 < k < len(times) and times[k] == time:
-                    _update(handle, node.varying, k)
-        # The last state is shown for a while as well.
-        recording.insert_sleep(now / 100)
-        return recording.as_html()
+    with _quiet():
+        own = server(camera)
+        try:
+            handles = [(times, node, handle) for times, group in nodes for node, handle in placed(own.scene, group)]
+            recording = own.get_scene_serializer()
+            now = 0.0
+            for time in np.unique(np.concatenate([times for times, _ in nodes])):
+                recording.insert_sleep(float(time) - now)
+                now = float(time)
+                for times, node, handle in handles:
+                    k = int(np.searchsorted(times, time))
+                    if 0 < k < len(times) and times[k] == time:
+                        update(node, handle, k, k - 1)
+            # The last state is shown for a while as well.
+            recording.insert_sleep(now / 100)
+            return recording.as_html()
+        finally:
+            own.stop()
 
 
-def _update(handle, varying, k):
-    for name, values in varying.items():
-        if not np.array_equal(values[k], values[k - 1]):
+def placed(scene: "SceneApi", nodes: Sequence[SceneNode]) -> list[tuple[SceneNode, Any]]:
+    """Nodes with their handles, added to a scene as they are at the first time."""
+    return [(node, node.add(scene, **{name: values[0] for name, values in node.varying.items()})) for node in nodes]
+
+
+def update(node: SceneNode, handle: Any, k: int, before: int) -> None:
+    """Let a node be as at the time `k`, where it differs from the time `before`."""
+    for name, values in node.varying.items():
+        if not np.array_equal(values[k], values[before]):
             setattr(handle, name, values[k])
 
 
@@ -101,21 +103,32 @@ class Camera:
         camera.fov, camera.near, camera.far = self.field_of_view, 0.01 * distance, 100.0 * distance
 
 
+def server(camera: Camera) -> "ViserServer":
+    """A server for this machine only, with a view of an empty scene."""
+    with _quiet():
+        own = viser().ViserServer(host="127.0.0.1", verbose=False)
+    own.scene.set_up_direction(camera.up)
+    camera.place(own.initial_camera)
+    own.scene.configure_default_lights(True, cast_shadow=camera.shadows)
+    return own
+
+
+def stop(own: "ViserServer") -> None:
+    """End a server, which does not announce it."""
+    with _quiet():
+        own.stop()
+
+
 @contextmanager
-def _server() -> "Iterator[ViserServer]":
-    """A server that records a scene; it listens on this machine only, and nobody connects to it."""
-    # Otherwise the server would announce its address.
+def _quiet() -> Iterator[None]:
+    """Keep servers from announcing their addresses."""
     import rich
 
     with _RECORDS:
         console = rich.get_console()
         quiet, console.quiet = console.quiet, True
         try:
-            server = viser().ViserServer(host="127.0.0.1", verbose=False)
-            try:
-                yield server
-            finally:
-                server.stop()
+            yield
         finally:
             console.quiet = quiet
 

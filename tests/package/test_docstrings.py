@@ -103,6 +103,10 @@ speeds = mb.cases.grid(speed=np.linspace(0.0, 5.0, 3))
 mb.sweep(lambda speed: {"angle": 2.0 * speed}, speeds, "runs.zarr", progress=False)
 """,
 }
+BEFORE["spatial.Body.from_mesh"] = """
+import trimesh
+trimesh.creation.box((100.0, 20.0, 10.0)).export("arm.stl")
+"""
 BEFORE["spatial.MagicFormulaTyre"] = f"""
 import shutil
 shutil.copy({str(TYRE_FILE)!r}, "tyre.tir")
@@ -257,6 +261,12 @@ def test_examples_of_topics(name, names, capsys, monkeypatch):
             assert len(scope["motion"].events) == 1
         case "derivatives":
             assert np.isfinite(scope["slope"])
+        case "getting-started":
+            # The names of the script are those that all examples take up.
+            assert scope.keys() >= names.keys() | {"motion"}
+        case "signs-and-units":
+            assert capsys.readouterr().out.splitlines()[0] == "30°, 1.5e+07 Pa, 314.2 rad/s"
+            np.testing.assert_allclose(scope["hanging"].q[2], -np.pi / 2, atol=1e-9)
         case "inputs":
             assert scope["motion"].stats["num_steps"] > 0
         case "throw":

@@ -6,6 +6,7 @@ compares them with the package and with the cells, and in its long tests what is
 prints. Cells with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
 """
 
+import base64
 import hashlib
 import io
 import json
@@ -17,22 +18,21 @@ from typing import Any
 import equinox as eqx
 import jax
 import nbformat
-import numpy as np
 from nbclient import NotebookClient
-from PIL import Image, ImageOps
+from PIL import Image
 
 import jaxmb
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 # The rounding errors of two machines have nothing in common, and errors of solutions their size.
 ROUNDING, OF_ERRORS, OF_VALUES = 1e-9, 20.0, 0.05
-# Mechanisms that the README shows: the end of the motion [s], and the number of poses.
+# Figures of notebooks that the README shows: the notebook and the cell.
 GALLERY = {
-    "andrews": (0.03, 4),
-    "bricard": (2.0, 4),
-    "n_four_bar": (1.0, 4),
-    "net": (1.0, 3),
-    "tracked_vehicle": (2.0, 3),
+    "excavator": ("16_loads", "loads-06"),
+    "forces": ("16_loads", "loads-06b"),
+    "worst_loads": ("16_loads", "loads-11"),
+    "coupler_point": ("09_design_and_stability", "cell8"),
+    "bicycle": ("09_design_and_stability", "cell12"),
 }
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
 
@@ -132,17 +132,12 @@ def _bare(figure, width, height):
 
 
 def picture(name: str, path: Path) -> None:
-    """A PNG of a mechanism of `GALLERY`."""
-    t1, frames = GALLERY[name]
-    machine = jaxmb.mechanisms.get(name)
-    saveat = np.linspace(0.0, t1, 101)
-    motion = jaxmb.simulate(machine.system, machine.state, t1=t1, saveat=saveat, rtol=1e-6)
-    figure = jaxmb.viz.plot_mechanism(motion, frames=frames)
-    _bare(figure, 4.0, 3.0)
-    file = io.BytesIO()
-    figure.savefig(file, dpi=100)
-    shown = Image.open(file).convert("RGB")
-    shown = shown.crop(ImageOps.invert(shown).getbbox())
+    """A small PNG of a figure of `GALLERY`."""
+    notebook, cell = GALLERY[name]
+    (outputs,) = [x.outputs for x in nbformat.read(FOLDER / f"{notebook}.ipynb", as_version=4).cells if x.id == cell]
+    (data,) = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    shown = Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
+    shown.thumbnail((640, 480), Image.Resampling.LANCZOS)
     shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(path, optimize=True)
 
 

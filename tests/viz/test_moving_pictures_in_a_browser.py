@@ -201,3 +201,41 @@ mb.viz.show(motion, points=["bar"])
     page.wait(f"{SLIDER} != null")
     page.value("document.querySelector('iframe').scrollIntoView()")
     check_it_plays(page)
+
+
+@pytest.mark.parametrize("in_a_cell", [False, True])
+def test_explorer_moves_with_its_sliders(in_a_cell, motions, page, tmp_path):
+    """On its page, and in the frame of a notebook's cell: a slider that a user moves changes picture and curve."""
+    page.call("Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1)
+    system, bounds = motions["four_bar"].system, {"coupler.mass": (1.0, 5.0)}
+    explorer = mb.viz.explore(
+        system, bounds, state=mb.mechanisms.get("four_bar").state, quantities="rocker.angle", t1=1.0
+    )
+    try:
+        cell = tmp_path / "cell.html"
+        cell.write_text(f"<html><body>{explorer._repr_html_()}</body></html>")
+        page.call("Page.navigate", url=cell.as_uri() if in_a_cell else explorer.url)
+        end = time.monotonic() + 120
+        while len(np.unique((page._seen().reshape(-1, 3) * 16).round(), axis=0)) < 40:
+            assert time.monotonic() < end
+            time.sleep(0.5)
+        first = page.picture()
+        explorer.set({"A.angle": 0.4})
+        # The linkage at the left, and at the right the slider, the numbers and the curve.
+        for side in (slice(400), slice(500, None)):
+            while np.count_nonzero(np.abs(page._seen() - first)[:, side].max(axis=-1) > 0.1) < 300:
+                assert time.monotonic() < end
+                time.sleep(0.5)
+        if not in_a_cell:
+            sliders = "document.querySelectorAll('.mantine-Slider-root')"
+            box = page.value(
+                f"(() => {{ const b = {sliders}[1].getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; }})()"
+            )
+            page.click(box[0] + 0.1 * box[2], box[1] + 0.5 * box[3])
+            while explorer.values["coupler.mass"] == 3.0:
+                assert time.monotonic() < end
+                time.sleep(0.1)
+            assert 1.0 <= explorer.values["coupler.mass"] < 2.0
+        assert not page.complaints
+    finally:
+        explorer.close()

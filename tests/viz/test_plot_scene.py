@@ -8,6 +8,8 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 import jaxmb as mb
 from jaxmb import planar, spatial, viz
 
+MOST_PROGRAMS = 70
+
 
 def bar(name, length, position, angle):
     return planar.Body(name, mass=1.0, inertia=planar.rod(1.0, length), position=position, angle=angle)
@@ -106,3 +108,14 @@ def test_balls_of_a_chain_of_masses_do_not_touch():
     (axes,) = viz.plot_scene(mb.Scene(masses, joints=rods)).axes
     balls = [np.ptp(patch.get_path().vertices[:, 0]) for patch in axes.patches]
     assert len(balls) == count and min(balls) > 0.05 and max(balls) < 0.5
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_plot_scene_has_room_beside_a_thin_machine(flat):
+    way = np.array([1.0, 0.0] if flat else [0.0, 1.0])
+    bodies = [planar.Body(f"b{k}", mass=1.0, inertia=0.1, position=(2 * k + 1) * way) for k in range(4)]
+    ends = ["ground", *(body.name for body in bodies)]
+    joints = [planar.Revolute(f"j{k}", ends[k], ends[k + 1], point=2 * k * way) for k in range(4)]
+    (axes,) = viz.plot_scene(mb.Scene(bodies, joints=joints)).axes
+    long, thin = sorted((np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())))[::-1]
+    assert thin == pytest.approx(long / 5)

@@ -11,7 +11,7 @@ from trajectories import motion_of
 import jaxmb as mb
 from jaxmb import planar, viz
 from jaxmb._pictured import picture
-from jaxmb.bodies.units import effort, named
+from jaxmb.bodies.units import effort, named, parameter_unit
 from jaxmb.studies.identify import Identification
 from jaxmb.studies.optimise.optimise import ConstrainedOutput
 from jaxmb.studies.optimise.trials import Iteration
@@ -168,9 +168,22 @@ def test_units_of_quantities_and_actuators(double):
         ("motor.lag", "lag", "s"),
     ):
         assert effort(system, name) == (word, unit), name
+    found = {name: parameter_unit(system, name) for name in ("b1.mass", "p1.point_b[0]", "gravity.acceleration[1]")}
+    assert found == {"b1.mass": "kg", "p1.point_b[0]": "m", "gravity.acceleration[1]": "m/s²"}
     assert shown_unit("Pa", np.array([3e7])) == (1e-6, "MPa") and shown_unit("N", np.array([999.0])) == (1.0, "N")
     assert shown_unit("m", np.array([2e-5])) == (1e6, "µm") and shown_unit("m", np.array([0.02]))[1] == "mm"
     assert shown_unit("m", np.zeros(2)) == (1.0, "m") and shown_unit("rad", np.array([1e5])) == (1.0, "rad")
+
+
+def test_states_of_a_controller_have_the_units_that_were_given(double):
+    law = lambda t, measured, states, p: (p["gain"] * measured["angle"], {"sum": measured["angle"]})
+    units = {"sum": "rad s", "gain": "N m/rad"}
+    numbers = {"states": {"sum": 0.0}, "parameters": {"gain": 1.0}, "units": units}
+    bar = planar.Body("bar", mass=1.0, inertia=0.1)
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    control = mb.Controller("pid", law, {"angle": "pin.angle"}, "pin.angle", **numbers)
+    system = mb.Scene([bar], joints=[pin], forces=[control]).compile()
+    assert named(system, "pid.sum").unit == "rad s" and parameter_unit(system, "pid.gain") == "N m/rad"
 
 
 # Inverse dynamics and loads

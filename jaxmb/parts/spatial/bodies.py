@@ -1,6 +1,7 @@
 """Spatial bodies, and moments of inertia of common shapes."""
 
-from typing import Any, ClassVar, Literal, get_args
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,6 +11,8 @@ from ...linalg.arrays import namespace
 from .. import fields
 from ..base import AbstractBody, AbstractSpatialPart
 from ..fields import as_parameter
+from ..shapes import Mesh
+from .mesh_solid import MeshSolid
 
 Axis = Literal["x", "y", "z"]
 
@@ -78,6 +81,30 @@ class Body(AbstractRigidBody):
         shape=None, unit="kg m²", sign="positive definite", converter=inertia_matrix
     )
     centre: fields.Number = fields.parameter(shape=("d",), unit="m", optional=True)
+
+    @classmethod
+    def from_mesh(cls, name: str, path: str | Path, *, density: float, scale: Any = 1.0, **pose: Any) -> Self:
+        """A homogeneous body from a closed surface in a file that trimesh reads, such as STL, OBJ, PLY or GLB.
+
+        ```python
+        arm = spatial.Body.from_mesh("arm", "arm.stl", density=2700.0, scale=1e-3)
+        hinge = spatial.Revolute("hinge", "ground", "arm", point=(-0.05, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+        system = jaxmb.Scene([arm], joints=[hinge], forces=[jaxmb.Gravity((0.0, 0.0, -9.81))]).compile()
+        picture = {"shapes": {"arm": jaxmb.shapes.Mesh.read("arm.stl", scale=1e-3)}}  # For viz.show.
+        ```
+
+        The body's frame is the frame of the file, so that points are given in the coordinates of the drawing.
+
+        **Arguments:** `density` [kg/m³] > 0; `scale` [m per unit of the file], 1e-3 for millimetres; `position`,
+        `orientation`, `velocity` and `angular_velocity` as of a `Body`.
+
+        **Raises:** `ValueError` for a surface with holes or with triangles that face both ways, and for a file that
+        trimesh cannot read; `ImportError` without trimesh, which `jaxmb[view]` installs.
+        """
+        surface = Mesh.read(path, scale=scale)
+        solid = MeshSolid.of(surface.vertices, surface.faces, f"Body {name!r}: {str(path)!r}")
+        numbers = {"mass": density * solid.volume, "inertia": density * solid.inertia, "centre": solid.centre}
+        return cls(name, **numbers, **pose)
 
     def pose(self):
         pose = super().pose()

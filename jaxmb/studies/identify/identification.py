@@ -12,6 +12,7 @@ from jaxtyping import ArrayLike
 from ..._arguments import package_for_tables
 from ..._pictured import picture
 from ..._printed import Printed
+from ...bodies.units import named, parameter_unit
 from .density import LogDensity, logdensity
 from .fit import Fit, flat
 from .prediction import HeldOut, Prediction, held_out, predict
@@ -197,10 +198,24 @@ class Identification(Printed, Fit):
         return (_NO_FIT + ":", *self.warnings) if self.warnings else (self.message,)
 
     @property
-    def _rows(self) -> list[tuple[str, str, str, str]]:
-        """For each component its name, start, estimate, and standard deviation, or the reason for its absence."""
+    def _rows(self) -> list[tuple[str, str, str, str, str]]:
+        """For each component its name, start, estimate, standard deviation or the reason for its absence, and unit."""
         columns = zip(self.components, *map(flat, (self.start, self.parameters, self.deviations)), strict=True)
-        return [(name, f"{a:.6g}", f"{b:.6g}", self.reasons.get(name, f"{c:.2g}")) for name, a, b, c in columns]
+        return [
+            (name, f"{a:.6g}", f"{b:.6g}", self.reasons.get(name, f"{c:.2g}"), self._unit(name))
+            for name, a, b, c in columns
+        ]
+
+    def _unit(self, name: str) -> str:
+        """The unit of a component of a parameter, a start value or a sensor's bias or delay; "" if it is unknown."""
+        system, base = self.problem.system, name.split("[")[0].rpartition("/")[2].removeprefix("initial.")
+        if base in {**system.coordinate_names(), **system.rate_names()}:
+            return named(system, base).unit
+        channels = {channel.name: channel for trial in self.problem.trials for channel in trial.channels}
+        sensor, _, number = base.rpartition(".")
+        if sensor in channels and number in ("bias", "delay"):
+            return "s" if number == "delay" else named(system, channels[sensor].quantity).unit
+        return parameter_unit(system, base)
 
     def __repr__(self) -> str:
         return f"Identification of {', '.join(self.parameters)}: {self.message}"
@@ -208,14 +223,14 @@ class Identification(Printed, Fit):
     def __str__(self) -> str:
         headline, *reasons = self._headlines
         width = max(len("parameter"), *map(len, self.components))
-        table = [("parameter", "start", "estimate", "deviation"), *self._rows]
+        table = [("parameter", "start", "estimate", "deviation", "unit"), *self._rows]
         return "\n".join(
             [
                 headline,
                 *(f"- {reason}" for reason in reasons),
                 *(
-                    f"{name:{width}}  {start:>12}  {value:>12}  {deviation:>12}"
-                    for name, start, value, deviation in table
+                    f"{name:{width}}  {start:>12}  {value:>12}  {deviation:>12}  {unit}".rstrip()
+                    for name, start, value, deviation, unit in table
                 ),
                 f"{self.size_of_residuals}, {self.iterations} iterations",
             ]

@@ -39,7 +39,7 @@ def write_report(
     if reasons:
         parts.append("<ul>" + "".join(f"<li>{reason}</li>" for reason in reasons) + "</ul>")
     parts += [
-        _table(("parameter", "start", "estimate", "standard deviation"), rows),
+        _table(("parameter", "start", "estimate", "standard deviation", "unit"), rows),
         f"<p>{fit.size_of_residuals}</p>",
     ]
     for direction in fit.combinations:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..._arguments import package_for_tables
 from ..._pictured import picture
 from ..._types import State, VectorLike
+from ...bodies.units import effort
 from ...linalg.arrays import is_traced
 from ...linalg.failure import nan_where
 from ...parts.names import names_arguments, unknown
@@ -110,8 +111,8 @@ class RequiredForces(eqx.Module):
         if is_traced((self.ts, self.forces)):
             return super().__repr__()
         largest = {name: np.max(np.abs(force), initial=0.0) for name, force in self.forces.items()}
-        sizes = ", ".join(f"{name} {size:.4g}" for name, size in largest.items())
-        return f"RequiredForces at {self.ts.size} times; largest, in SI units: {sizes}"
+        sizes = ", ".join(f"{name} {x:.4g} {effort(self.machine, name)[1]}".rstrip() for name, x in largest.items())
+        return f"RequiredForces at {self.ts.size} times; largest: {sizes}"
 
 
 @names_arguments

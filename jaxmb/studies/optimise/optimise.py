@@ -14,6 +14,7 @@ from ..._arguments import package_for_tables, whole_number
 from ..._pictured import picture
 from ..._printed import Printed
 from ..._types import VectorLike
+from ...bodies.units import parameter_unit
 from ...parts.names import names_arguments
 from ...system import AbstractSystem
 from ...system.design import Bounds
@@ -98,7 +99,8 @@ class Optimum(Printed):
     - `success`: whether the method converged to a minimum and all constraints hold within their `tolerance`. A maximum,
         a saddle, a step of the objective, and an edge beyond which trials fail or the objective leaps up are not
         minima; `message`: why the method ended.
-    - `derivatives`: the mode, `"forward"` or `"reverse"`.
+    - `derivatives`: the mode, `"forward"` or `"reverse"`; `units` of the components of the parameters by name, where
+        `optimise` was given their `system`.
     """
 
     parameters: dict[str, np.ndarray]
@@ -114,6 +116,7 @@ class Optimum(Printed):
     success: bool
     message: str
     derivatives: str
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def components(self) -> list[tuple[str, float, float]]:
@@ -153,8 +156,8 @@ class Optimum(Printed):
 
     def __str__(self) -> str:
         numbers = lambda *given: tuple(f"{float(x):.6g}" for x in given)
-        rows: list[tuple[str, ...]] = [("parameter", "start", "optimum")]
-        rows += [(word, *numbers(a, b)) for word, a, b in self.components]
+        rows: list[tuple[str, ...]] = [("parameter", "start", "optimum", "unit" * bool(self.units))]
+        rows += [(word, *numbers(a, b), self.units.get(word, "")) for word, a, b in self.components]
         rows += [(), ("output", "before", "after")]
         rows += [(name, *numbers(self.before[name], x)) for name, x in self.outputs.items() if x.ndim == 0]
         if self.constraints:
@@ -273,7 +276,9 @@ def optimise(
     points, spent = starting_points(program, limited, first, shapes, starts, seed, max_iterations)
     runs = [_run(program, limited, z, method, tol, max_iterations) for z in points]
     runs.sort(key=lambda run: run.trials.merit(run.trials.best))
-    return _optimum(first, shapes, runs, spent)
+    best = _optimum(first, shapes, runs, spent)
+    found = {name: "" if system is None else parameter_unit(system, name) for name, *_ in best.components}
+    return dataclasses.replace(best, units={name: unit for name, unit in found.items() if unit})
 
 
 class _Run(NamedTuple):
