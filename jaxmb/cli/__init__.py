@@ -1,3 +1,3 @@
-"""The command line: `jaxmb mechanisms | run | doctor | help`."""
+"""The command line: `jaxmb mechanisms | run | sweep | doctor | help`."""
 
 from .commands import main as main

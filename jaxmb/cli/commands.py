@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from .. import mechanisms
 from .._setup import VARIABLE, setup
 from .._traced_functions import is_of_user
-from . import doctor, help, run
+from . import doctor, help, run, sweep
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = out.add_subparsers(required=True, metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
-    for command in (run, doctor, help):
+    for command in (run, sweep, doctor, help):
         command.add_to(commands)
     return out
 

@@ -1,22 +1,33 @@
-"""`jaxmb doctor`: the machine, its installed packages, and the cache of compiled programs."""
+"""`jaxmb doctor`: the machine, its installed packages, and, with `--measure`, the times of first calls and steps."""
 
 import argparse
+import functools
 import importlib.metadata
+import json
 import os
 import platform
+import subprocess
+import sys
+import tempfile
 import textwrap
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
+from .. import mechanisms
 from .._faulty_versions import fault_of
 from .._machine import cores, limit_of_threads
+from .._results import RESULTS
 from .._setup import VARIABLE, kept_in
 from .._version import __version__
+from ..report.table import aligned
+from ..report.timing import interleaved
+from ..simulate import simulate
 
 _NEEDED = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "numpy")
 # The packages of each extra.
@@ -27,6 +38,54 @@ _OPTIONAL = {
     "import": ("mujoco",),
     "studies": ("cloudpickle", "xarray", "zarr"),
 }
+_STEPPED = ("four_bar", "andrews", "rod_chain", "tracked_vehicle")
+_RTOL, _REPEATS = 1e-8, 5
+# Waiting times in a new process [s]: imports, and for some machines the first value with its scene, the first gradient,
+# and the second call of each.
+_FIRST_CALLS = """
+import time
+times = [time.perf_counter()]
+done = lambda: times.append(time.perf_counter())
+import diffrax, jax
+done()
+import jaxmb as mb
+mb.simulate, mb.Scene
+done()
+mb.setup()
+stop = mb.Stop("stop", "slide.displacement", lower=0.3, restitution=0.5)
+machines = [
+    ("four_bar", "coupler", [], None),
+    ("spatial_slider_crank", "slider", [], None),
+    ("slider_crank", "slider", [stop], None),
+    ("stiff_four_bar", "coupler", [], mb.solvers.Hermite()),
+]
+spans = []
+for name, body, joints, solver in machines:
+    done()
+    machine = mb.mechanisms.get(name)
+    system = machine.scene.extended(joints=joints).compile() if joints else machine.system
+    start = mb.assemble(system, fix=machine.fix, rates=machine.rates) if joints else machine.state
+    t1 = 0.02 if solver else machine.t1 / 10
+
+    def end(mass):
+        own = mb.with_parameters(system, {body + ".mass": mass})
+        state = mb.assemble(own, start)
+        return mb.simulate(own, state, t1=t1, rtol=1e-8, solver=solver, throw=False).ys.u[-1, 0]
+
+    mass = float(mb.parameters(system)[body + ".mass"])
+    for call in (end, jax.grad(end)):
+        for _ in range(2):
+            call(mass).block_until_ready()
+            done()
+import json
+print(json.dumps([after - before for before, after in zip(times, times[1:])]))
+"""
+# The indices of the table's rows among the printed durations.
+_SHOWN = {"import jax, diffrax": 0, "import jaxmb": 1} | {
+    f"{name}: {call}": 3 + 5 * k + place
+    for k, name in enumerate(("four_bar", "spatial_slider_crank", "slider_crank with a stop", "stiff_four_bar"))
+    for call, place in {"first value": 0, "first gradient": 2, "another value": 1, "another gradient": 3}.items()
+}
 # The format of facts. Names and paths are not broken, so that they can be copied.
 _INDENT = 18
 _FILLED = textwrap.TextWrapper(80, subsequent_indent=" " * _INDENT, break_long_words=False, break_on_hyphens=False)
@@ -34,14 +93,29 @@ _FILLED = textwrap.TextWrapper(80, subsequent_indent=" " * _INDENT, break_long_w
 
 def add_to(commands: Any) -> None:
     """Add the command to a parser's commands."""
-    command = commands.add_parser("doctor", help="show the machine, installed packages, and the cache of programs")
+    command = commands.add_parser(
+        "doctor",
+        help="show installed packages, the cache of compiled programs, and, with --measure, waiting times here",
+    )
+    command.add_argument("--measure", action="store_true", help="measure first calls and steps, some minutes")
+    command.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)
     command.set_defaults(command=_doctor)
 
 
 def _doctor(arguments: argparse.Namespace) -> None:
-    del arguments
+    if arguments.quick:
+        raise ValueError("`jaxmb doctor` is quick without --quick; --measure measures.")
     for name, text in _facts():
         print(_FILLED.fill(f"{name:{_INDENT}}{text}"))
+    if not arguments.measure:
+        return
+    print(
+        "\nCalls in a new process [s], values with their scenes; the second process finds the first one's programs in "
+        "the cache:\n"
+    )
+    print("\n".join(aligned(_first_calls())))
+    print(f"\nWarm steps under jit at rtol {_RTOL:g}, the shortest of {_REPEATS} runs:\n")
+    print("\n".join(aligned(_steps())))
 
 
 def _facts() -> Iterable[tuple[str, str]]:
@@ -119,3 +193,43 @@ def _kept() -> str:
     home = os.path.expanduser("~")
     shown = Path("~") / folder.relative_to(home) if folder.is_relative_to(home) else folder
     return f"{len(sizes)} in {shown}, {used} MiB"
+
+
+def _first_calls() -> list[list[str]]:
+    """The waiting times of two processes; the second finds the programs of the first in the cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        kept = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+        environment = kept | {VARIABLE: folder}
+        both = [_durations(environment) for _ in range(2)]
+    rows = [[name, *(f"{durations[place]:.3f}" for durations in both)] for name, place in _SHOWN.items()]
+    return [["", "first", "second"], *rows]
+
+
+def _durations(environment: dict[str, str]) -> list[float]:
+    run = subprocess.run([sys.executable, "-c", _FIRST_CALLS], env=environment, capture_output=True, text=True)
+    if run.returncode:
+        raise RuntimeError(f"A new process failed: {run.stderr.strip().splitlines()[-1]}")
+    return json.loads(run.stdout)
+
+
+def _steps() -> list[list[str]]:
+    """The number of steps of some motions, and the time of a step."""
+    motions = [mechanisms.get(name) for name in _STEPPED]
+    runs = [functools.partial(_motion, single.system, single.state, single.t1) for single in motions]
+    rows = [["", "bodies", "t1 [s]", "steps", "run [ms]", "step [µs]"]]
+    for single, run, times in zip(motions, runs, interleaved(runs, _REPEATS), strict=True):
+        stats, result, _ = run()
+        if result != RESULTS.successful:
+            raise RuntimeError(f"{single.name}: {RESULTS[result]}")
+        steps, seconds = int(stats["num_steps"]), min(times)
+        bodies = str(len(single.system.body_names))
+        rows.append(
+            [single.name, bodies, f"{single.t1:g}", str(steps), f"{1e3 * seconds:.1f}", f"{1e6 * seconds / steps:.1f}"]
+        )
+    return rows
+
+
+@eqx.filter_jit
+def _motion(system: Any, state: Any, t1: Any) -> Any:
+    motion = simulate(system, state, t1=t1, rtol=_RTOL, throw=False)
+    return motion.stats, motion.result, motion.ys

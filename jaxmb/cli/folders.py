@@ -6,6 +6,7 @@ import sys
 import webbrowser
 from pathlib import Path
 
+from ..report import Table
 from ..system import AbstractSystem
 from ..trajectory import Trajectory
 from ..viz import plot_mechanism, plot_motion, save_html
@@ -34,18 +35,21 @@ def made_folder(arguments: argparse.Namespace) -> Path:
     return out
 
 
-def write_figures(out: Path, trajectory: Trajectory) -> None:
-    """Write the figures of a motion; without Matplotlib print a message."""
+def write_figures(out: Path, precision: Table, trajectory: Trajectory) -> None:
+    """Write the figures of a report and of a motion; without Matplotlib print a message."""
     try:
+        precision.figure(out / "work_precision.png")
+        written = [out / "work_precision.png"]
         figures = {"motion.png": plot_motion(trajectory)}
         if trajectory.system.body_names:
             figures["mechanism.png"] = plot_mechanism(trajectory)
+        for name, figure in figures.items():
+            figure.savefig(out / name, dpi=150)
+            written.append(out / name)
     except ImportError as error:
         print(error)
         return
-    for name, figure in figures.items():
-        figure.savefig(out / name, dpi=150)
-    print("Wrote " + ", ".join(str(out / name) for name in figures))
+    print("Wrote " + ", ".join(map(str, written)))
 
 
 def check_picture(system: AbstractSystem) -> None:

@@ -1151,6 +1151,7 @@ FAULTS = [
     ),
     # Reports, pictures, commands, mechanisms
     Fault("cli/doctor.py", "text if all(versions.values())", "text if any(versions.values())"),
+    Fault("cli/run.py", "np.linalg.norm(np.stack(others) - first, axis=1)", "np.linalg.norm(np.stack(others), axis=1)"),
     Fault(
         "mechanisms/_relative.py",
         "return jnp.concatenate([behind[:1], -behind[1:]])",

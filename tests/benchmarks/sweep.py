@@ -1,8 +1,9 @@
-"""Sweeps: cost over a bare `jax.vmap`, the cores of one process, and whole studies.
+"""Sweeps: cost over a bare `jax.vmap`, the cores of one process, and whole studies from the command line.
 
 Run it with `NPROC=1 python tests/benchmarks/sweep.py overhead`; with `cores`, without `NPROC`, to compare the cores of
 one process; and the studies with
-`MEMBERS=100000 python tests/benchmarks/sweep_four_bar.py` and `MEMBERS=2000 python tests/benchmarks/sweep_vehicle.py`.
+`MEMBERS=100000 jaxmb sweep tests/benchmarks/sweep_four_bar.py --out four_bar.zarr --processes 2` and
+`MEMBERS=2000 jaxmb sweep tests/benchmarks/sweep_vehicle.py --out vehicle.zarr --processes 2`.
 """
 
 import functools

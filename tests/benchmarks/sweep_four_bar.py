@@ -1,4 +1,4 @@
-"""A study: four-bars with cranks of different lengths; the environment's MEMBERS says how many."""
+"""A study for `jaxmb sweep`: four-bars with cranks of different lengths; the environment's MEMBERS says how many."""
 
 import os
 
@@ -23,6 +23,3 @@ def four_bar(length, t1, max_steps=65536):
 function = four_bar
 cases = mb.cases.table(length=np.linspace(0.8, 1.1, int(os.environ.get("MEMBERS", "10000"))), t1=0.5)
 units = {"length": "m", "t1": "s", "angle": "rad"}
-
-if __name__ == "__main__":
-    mb.sweep(function, cases, "four_bar.zarr", units=units, processes=2)

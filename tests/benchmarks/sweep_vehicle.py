@@ -1,4 +1,4 @@
-"""A study: tracked vehicles, height of the bump × speed × stiffness of the torsion bars."""
+"""A study for `jaxmb sweep`: tracked vehicles, height of the bump × speed × stiffness of the torsion bars."""
 
 import os
 
@@ -33,6 +33,3 @@ cases = mb.cases.grid(
 dims = {"height_of_hull": ["time"], "pitch": ["time"]}
 coords = {"time": TS}
 units = {"height": "m", "speed": "m/s", "stiffness": "N m/rad", "time": "s", "pitch": "rad", "height_of_hull": "m"}
-
-if __name__ == "__main__":
-    mb.sweep(function, cases, "vehicle.zarr", dims=dims, coords=coords, units=units, processes=2)

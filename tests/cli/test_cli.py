@@ -3,7 +3,10 @@
 import importlib
 import subprocess
 import sys
+import types
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxmb as mb
@@ -22,27 +25,33 @@ def test_mechanisms(capsys):
 
 @pytest.mark.slow
 def test_run(capsys, tmp_path):
-    """A run prints errors against reference values, and writes its files."""
-    words = ["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--out", str(tmp_path)]
+    """A run prints errors against reference values and a fit next to the truth, and writes its files."""
+    words = ["run", "pendulum", "--t1", "1", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
-    for text in ("pendulum", "elliptic functions", "Relative error at 1 s"):
+    for text in ("pendulum", "elliptic functions", "Error against run time", "Identifying bar.length", "true value 1"):
         assert text in out
     motion = mb.load(tmp_path / "motion.npz")
     assert motion["t"][-1] == 1.0 and motion["bob.position"].shape == (motion["t"].size, 2)
-    for name in ("motion.png", "mechanism.png"):
+    for name in ("work_precision.png", "motion.png", "mechanism.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
 def test_run_of_a_lagrangian_system(capsys, tmp_path):
     """Coordinates take the place of positions, and of the picture of the mechanism."""
-    assert main(["run", "roller_racer", "--rtol", "1e-8", "--out", str(tmp_path)]) == 0
+    assert main(["run", "roller_racer", "--rtol", "1e-8", "--tolerances", "1e-6", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    for text in ("QuasiVelocityFrame", "no constraints", "DOP853"):
+    for text in (
+        "QuasiVelocityFrame",
+        "no constraints",
+        "DOP853",
+        "Identifying handle from coordinates",
+        "true value 0.2",
+    ):
         assert text in out
     assert mb.load(tmp_path / "motion.npz")["theta"][-1] == pytest.approx(6.2350455697, abs=1e-6)
-    assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"motion.npz", "motion.png", "work_precision.png"}
 
 
 WRONG_RUNS = [
@@ -63,6 +72,15 @@ def test_wrong_words_are_told(capsys, tmp_path):
     for words, message in WRONG_RUNS:
         assert main(["run", *words, "--out", str(tmp_path)]) == 2
         assert message in (told := capsys.readouterr().err) and told.count("\n") == 1
+
+
+def test_run_fits_the_parameter_that_moves_most(monkeypatch):
+    """Of the pendulum's mass, which moves it by one length per relative change here, and its length, by minus five."""
+    at = lambda values: jnp.stack([100.0 + values["bob.mass"] - 5.0 * values["bar.length"]])
+    moved = lambda system, state, **options: types.SimpleNamespace(quantity=lambda name: at(mb.parameters(system)))
+    monkeypatch.setattr(run, "simulate", moved)
+    monkeypatch.setattr(run, "assemble", lambda system, state, **options: state)
+    assert run._most_sensitive(mb.mechanisms.get("pendulum"), np.linspace(0.0, 1.0, 3)) == "bar.length"
 
 
 def test_run_of_a_function_with_arguments_says_which_it_needs(capsys, tmp_path):

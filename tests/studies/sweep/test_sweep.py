@@ -21,6 +21,7 @@ import xarray as xr
 from sweeping import CASES, CHUNKS, files, forked, marks, run, spring, wait_for
 
 import jaxmb as mb
+from jaxmb.cli import main
 from jaxmb.studies.sweep import store as stores
 from jaxmb.studies.sweep.chunk import Work
 
@@ -393,6 +394,31 @@ def test_progress_tells_of_compiling_the_time_left_and_failures(capsys):
     first, *_, last = shown.split("\r")
     assert first.startswith("compiling:   0%") and "0/2" in first and "\n" not in shown
     assert last.startswith("100%") and "2/2" in last and "00:00" in last and "1 failed" in last
+
+
+def test_the_command_line(capsys, tmp_path):
+    file = tmp_path / "study.py"
+    file.write_text(
+        "import jax.numpy as jnp, numpy as np, jaxmb as mb\n"
+        "def function(a, b):\n    return {'x': jnp.sqrt(a) * b}\n"
+        "cases = mb.cases.grid(a=[-1.0, 4.0], b=np.arange(3.0))\nunits = {'x': 'm'}\n"
+        "def bad(a, b):\n    return {'x': float(a)}\n"
+    )
+    words = ["sweep", str(file), "--out", str(tmp_path / "runs.zarr"), "--chunk", "2"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "6 members, 3 of them failed" in out and "3 not_finite: An output is not finite." in out
+    found = mb.load_sweep(tmp_path / "runs.zarr")
+    np.testing.assert_array_equal(found["x"].sel(a=4.0), [0.0, 2.0, 4.0])
+    assert found["x"].attrs == {"units": "m"}
+    for source, code, message in (
+        ("study.py", 2, "There is no file"),
+        (f"{file}:function", 2, "must be file.py or file.py:function:cases"),
+        (f"{file}:functon:cases", 2, "did you mean 'function'"),
+        (f"{file}:bad:cases", 2, "study.py:7: `return {'x': float(a)}` needs a parameter as a number"),
+    ):
+        assert main(["sweep", source, *words[2:]]) == code
+        assert message in capsys.readouterr().err
 
 
 def _with_small_disk(store):
