@@ -75,7 +75,8 @@ from .studies.identify import (
 
 ## Optimisation
 from .studies.optimise import optimise as optimise, Optimum as Optimum, robust as robust
-from .studies.plan import plan as plan, Plan as Plan, plan_phases as plan_phases, Phase as Phase, PhasedPlan as PhasedPlan
+from .studies.plan import plan as plan, Plan as Plan
+from .studies.plan import plan_phases as plan_phases, Phase as Phase, PhasedPlan as PhasedPlan
 
 ## Small motions
 from .studies.linear import (

@@ -1005,7 +1005,11 @@ FAULTS = [
         "target = np.append(-model.residuals, np.zeros_like(weights)) - whole @ closed",
         "target = np.append(-model.residuals, np.zeros_like(weights))",
     ),
-    Fault("studies/evaluate.py", '(("q", system.coordinate_names()), ("u", ', '(("u", system.coordinate_names()), ("q", '),
+    Fault(
+        "studies/evaluate.py",
+        '(("q", system.coordinate_names()), ("u", ',
+        '(("u", system.coordinate_names()), ("q", ',
+    ),
     Fault("studies/plan/courses.py", "3 * (b - a) - 2 * rate_a - rate_b", "3 * (b - a) - 2 * rate_a + rate_b"),
     Fault("studies/plan/courses.py", "numbers[1] - numbers[0]", "numbers[1]"),
     Fault("studies/plan/lanes.py", "_ASIDE * np.where(scales > 0, scales, 1.0)", "np.where(scales > 0, scales, 1.0)"),

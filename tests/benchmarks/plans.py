@@ -1,8 +1,9 @@
 """Time and error of an optimal control problem, beside dymos where it is installed: `python tests/benchmarks/plans.py`.
 
 A cart of 1 kg swings up a pole of 0.5 m with 0.3 kg at its end, in 2 s and over 1 m, with the least ∫ F² dt. The exact
-objective of the published optimum is 58.80766746: Pontryagin's equations, solved by `scipy.integrate.solve_bvp`. Source:
-M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017.
+objective of the published optimum is 58.80766746: Pontryagin's equations, solved by `scipy.integrate.solve_bvp`.
+
+Source: M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review 59(4), 2017.
 """
 
 import time
