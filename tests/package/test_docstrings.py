@@ -111,6 +111,16 @@ BEFORE["spatial.MagicFormulaTyre"] = f"""
 import shutil
 shutil.copy({str(TYRE_FILE)!r}, "tyre.tir")
 """
+MOTOR = """
+motor = jaxmb.JointForce("motor", "pin.angle", force=0.0)
+system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
+"""
+BEFORE |= dict.fromkeys(("plan", "Phase", "plan_phases"), MOTOR)
+BEFORE["Plan.objective_of"] = f"""{MOTOR}
+rest, turned = ({{"pin.angle": angle, "pin.angle_rate": 0.0}} for angle in (0.0, 1.0))
+options = {{"controls": {{"motor.force": None}}, "duration": 1.0, "running": "effort", "intervals": 4}}
+best = jaxmb.plan(system, start=rest, end=turned, **options)
+"""
 BOUNCE = """
 ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.0, 0.5))
 floor = jaxmb.RigidContact("floor", "ball", terrain=jaxmb.terrain.Flat(), radius=0.1, restitution=0.8)

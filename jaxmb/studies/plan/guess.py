@@ -16,7 +16,6 @@ from ...parts.series import AbstractSignal
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
-from ...trajectory import Trajectory
 from ..evaluate import evaluate
 from .lanes import in_lanes
 from .task import Limits, Task
@@ -102,7 +101,7 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     shares = task.shares[np.unique(np.linspace(0, task.intervals, min(task.intervals, _KNOTS) + 1).round().astype(int))]
     times = ts[0] + (ts[-1] - ts[0]) * shares
     fixed = {name: [value(t) if callable(value) else value for t in times] for name, value in named.items()}
-    if not named and isinstance(task.end, Limits) and (there := _given(system, task.end, known, state, ts[0])):
+    if not named and not isinstance(task.end, State) and (there := _given(system, task.end, known, state, ts[0])):
         here = evaluate(system, state, list(there), t=ts[0])
         fixed = {
             name: [(1 - share) * np.asarray(here[name]) + share * value for share in shares]
@@ -217,7 +216,7 @@ def _on_constraints(system, ts, states, slopes):
 
 def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> State:
     """States along a motion or another plan, its time stretched to the duration."""
-    ys, times = (motion.ys if isinstance(motion, Trajectory) else motion.states), np.asarray(motion.ts)
+    ys, times = motion.states if hasattr(motion, "states") else motion.ys, np.asarray(motion.ts)
     if times.ndim != 1 or times.size < 2:
         raise ValueError("plan: a motion as the guess needs at least two saved times: simulate(…, saveat=times).")
     if np.shape(ys.q)[1:] != (system.nq,):

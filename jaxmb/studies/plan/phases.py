@@ -7,6 +7,7 @@ from typing import Any, Literal
 import jax
 from jaxtyping import ArrayLike
 
+from ..._arguments import check_kind
 from ..._printed import Printed
 from ..._types import State
 from ...parts.names import names_arguments
@@ -94,8 +95,10 @@ def plan_phases(
     **Raises:** `ValueError` as `plan`, and for a system that lacks the coordinates of the last.
     """
     phases = list(phases)
-    if not phases or not all(isinstance(phase, Phase) for phase in phases):
-        raise ValueError(f"plan_phases: give a list of jaxmb.Phase, got {phases!r}.")
+    for k, phase in enumerate(phases):
+        check_kind(f"plan_phases: phase {k}", phase, Phase, "a jaxmb.Phase", "make it of a system and its options")
+    if not phases:
+        raise ValueError("plan_phases: give at least one jaxmb.Phase.")
     check_minimised([(phase.running, phase.final) for phase in phases])
     options, tasks, guesses = method_options(method, max_iterations, tol, verbose), [], []
     for k, phase in enumerate(phases):

@@ -62,7 +62,7 @@ def plan(
     rest = {"pin.angle": 0.0, "pin.angle_rate": 0.0}
     turned = {"pin.angle": 1.0, "pin.angle_rate": 0.0}
     best = jaxmb.plan(system, controls={"motor.force": (-2, 2)}, duration=1.0, start=rest, end=turned, running="effort")
-    best.objective, best.controls["motor.force"], best.trajectory["bar"].angle
+    best.objective, best.controls["motor.force"]
     ```
 
     The objective is the integral of `running` plus `final`; it is minimised by multiple shooting. The unknowns of each

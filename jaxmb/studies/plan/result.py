@@ -22,7 +22,7 @@ from ..evaluate import Reading
 from .lanes import Model
 from .sensitivity import Sensitivity, derivatives, sensitivities
 from .solve import Iteration, Solution, solved
-from .task import Limits
+from .task import Named
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -141,7 +141,9 @@ class Plan(Printed):
         limits = self.solution.transcription.task.path
         if not limits.names:
             return {}
-        values = np.asarray(_along(self.system, limits, self.trajectory.ts, self.trajectory.ys, self.along))
+        values = np.asarray(
+            _along(self.system, Named(limits.names), self.trajectory.ts, self.trajectory.ys, self.along)
+        )
         excess = np.maximum(np.maximum(limits.low - values, values - limits.high), 0.0)
         return dict(zip(limits.components, map(float, np.max(excess, axis=0)), strict=True))
 
@@ -249,10 +251,10 @@ class Plan(Printed):
 
 
 @jitted
-def _along(system, limits, ts, ys, given):
+def _along(system, quantities, ts, ys, given):
     def of_one(t, state, own):
         now = with_parameters(system, own) if own else system
-        return jnp.concatenate([jnp.ravel(x) for x in limits(Reading(now, state, t, own))])
+        return jnp.concatenate([jnp.ravel(x) for x in quantities(Reading(now, state, t, own))])
 
     return jax.vmap(of_one)(ts, ys, given)
 
@@ -261,7 +263,7 @@ def _prices(solution: Solution) -> dict[str, np.ndarray]:
     transcription, answer = solution.transcription, solution.answer
     task, out = transcription.task, {}
     for where, limits in (("start", task.start), ("end", task.end), ("path", task.path)):
-        if not isinstance(limits, Limits):
+        if isinstance(limits, State):
             k = 0 if where == "start" else -1
             names = transcription.names_at(k)
             values = -answer.of_bounds[transcription.places.x[k]]

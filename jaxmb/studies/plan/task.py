@@ -27,17 +27,6 @@ class Limits:
     low: np.ndarray
     high: np.ndarray
 
-    def __call__(self, at: Reading) -> list[Any]:
-        """The quantities at an instant."""
-        return [at[name] for name in self.names]
-
-    # Programs are made anew for other names alone.
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Limits) and self.names == other.names
-
-    def __hash__(self) -> int:
-        return hash(self.names)
-
     @property
     def components(self) -> list[str]:
         """The names of all components."""

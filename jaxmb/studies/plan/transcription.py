@@ -266,7 +266,7 @@ class _Transcriber:
         self._join(self._arrival(steps))
         ends = {"start": (task.start, [0]), "end": (task.end, [task.intervals])}
         for where, (limits, at) in ends.items():
-            if isinstance(limits, Limits) and limits.names:
+            if not isinstance(limits, State) and limits.names:
                 self._limit(where, limits, at)
         if task.path.names:
             self._limit("path", task.path, list(range(task.intervals + 1)))
@@ -419,7 +419,7 @@ class _Transcriber:
 
     def _limit(self, where: str, limits: Limits, at: list[int]) -> None:
         count = len(limits.components)
-        first = self._look(limits, at, count)
+        first = self._look(Named(limits.names), at, count)
         names = [f"{name} at node {k}" for k in at for name in limits.components]
         sizes = np.tile(limits.sizes, len(at))
         rows = self._rows(where, names, np.tile(limits.low, len(at)) / sizes, np.tile(limits.high, len(at)) / sizes)
