@@ -15,7 +15,7 @@ from ...system import AbstractSystem
 from ...system.design import Bounds
 from .guess import carried, first_guess
 from .plan import check_minimised, method_options, task_of
-from .result import Plan
+from .result import Plan, judged
 from .solve import Iteration, solved
 
 
@@ -122,13 +122,13 @@ def plan_phases(
         tasks.append(task)
         guesses.append(first_guess(task, phase.guess, begin))
     solutions = solved(tasks, guesses, *options)
-    plans = tuple(Plan.of(solution, method, tol) for solution in solutions)
-    answer = solutions[0].answer
+    plans = tuple(judged(Plan.of(solution, method, tol)) for solution in solutions)
+    failed = next((one for one in plans if not one.success), plans[0])
     return PhasedPlan(
         phases=plans,
         objective=sum(one.objective for one in plans),
         duration=sum(one.duration for one in plans),
         iterations=solutions[0].iterations,
-        success=answer.success,
-        message=answer.message,
+        success=failed.success,
+        message=failed.message,
     )

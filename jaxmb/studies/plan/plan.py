@@ -18,7 +18,7 @@ from ...system.design import Bounds
 from ..evaluate import Reading
 from ..told import told_apart
 from .guess import first_guess
-from .result import Plan
+from .result import Plan, judged
 from .solve import Iteration, arcs_of, solved
 from .task import (
     Effort,
@@ -125,7 +125,7 @@ def plan(
         first, task = solution.iterations, dataclasses.replace(task, arcs=arcs_of(task, solution.found))
         (solution,) = solved([task], [solution.found], *options)
         solution = dataclasses.replace(solution, iterations=(*first, *solution.iterations))
-    return Plan.of(solution, method, tol)
+    return judged(Plan.of(solution, method, tol))
 
 
 def method_options(method: Any, max_iterations: Any, tol: Any, verbose: bool) -> tuple[Any, int, float, Any]:

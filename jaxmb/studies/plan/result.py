@@ -250,6 +250,22 @@ class Plan(Printed):
         return "\n".join([*(line.rstrip() for line in lines), "", self.message])
 
 
+def judged(plan: Plan) -> Plan:
+    """The plan, without success if contacts or dry friction would change their modes, which the intervals hold."""
+    contacts = plan.system.contacts
+    if not plan.success or not (contacts.contact_names or contacts.friction_names):
+        return plan
+    changes = [event for event in plan.trajectory.events if event.kind != "slip"]
+    if not changes:
+        return plan
+    first = changes[0]
+    message = (
+        f"{first.part!r} has the event {first.kind!r} at t = {first.time:.4g} s, and a plan holds the modes of its "
+        "start; take a phase up to there and another one from there, by plan_phases"
+    )
+    return dataclasses.replace(plan, success=False, message=message)
+
+
 @jitted
 def _along(system, quantities, ts, ys, given):
     def of_one(t, state, own):

@@ -189,6 +189,28 @@ def test_plan_by_cubic_controls_meets_the_exact_optimum_with_few_intervals(plann
     assert slopes.shape == values.shape
 
 
+@pytest.mark.slow
+def test_plan_that_would_strike_a_stop_says_so():
+    """A slider from rest to rest in two seconds, with a stop that it passes, or does not meet."""
+
+    def plan(place):
+        slider = planar.Body("slider", mass=1.0, inertia=1.0)
+        rail = planar.Prismatic("rail", "ground", "slider", point=(0.0, 0.0), axis=(1.0, 0.0))
+        stop = mb.Stop("stop", "rail.displacement", upper=place)
+        forces = [mb.JointForce("push", "rail.displacement", force=0.0)]
+        system = mb.Scene([slider], joints=[rail, stop], forces=forces).compile()
+        ends = ({"slider.x": x, "slider.x_rate": 0.0} for x in (0.0, 1.0))
+        options = {"duration": 2.0, "running": "effort", "intervals": 4}
+        return mb.plan(
+            system, controls={"push.force": None}, **dict(zip(("start", "end"), ends, strict=True)), **options
+        )
+
+    struck, free = plan(0.5), plan(2.0)
+    assert not struck.success and "'stop' has the event 'impact' at t = 1" in struck.message
+    # The force is linear in time, from 6 x / T² to its opposite, ∫ F² dt = 12 m² x² / T³.
+    assert free.success and free.objective == pytest.approx(1.5, rel=1e-9)
+
+
 GOOD = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 4}
 REFUSED = [
     ({"controls": {"motor.forc": None}}, "Unknown control 'motor.forc'; did you mean 'motor.force'?"),
