@@ -28,7 +28,7 @@ class Algebraic(NamedTuple):
 @jitted
 def algebraic(A: Float[Array, "k k"], B: Float[Array, "k i"], q: Float[Array, "k"], r: Float[Array, "i"]) -> Algebraic:
     """The regulator of `ż = A z + B w` with the weights q of z² and r of w²."""
-    G, Q = (B / r) @ B.T, jnp.diag(q)
+    G, Q = (B / r[None, :]) @ B.T, jnp.diag(q)
     X = riccati(A, G, Q)
     gains = (B.T @ X) / r[:, None]
     return Algebraic(gains, X, A - B @ gains, is_stabilising(A, G, Q, X))

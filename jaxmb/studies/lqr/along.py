@@ -155,7 +155,7 @@ def _regulator(plan, model, courses, weights, cost, labels, inputs):
     times = np.append((ts[:-1, None] + np.diff(ts)[:, None] * share).reshape(-1), ts[-1])
     ends = jax.tree.map(lambda y: np.asarray(y)[-1:], State(plan.states.q, plan.states.u, plan.states.z))
     states = jax.tree.map(lambda y, end: np.concatenate([np.asarray(y).reshape(-1, y.shape[-1]), end]), states, ends)
-    costs = np.concatenate([np.asarray(costs).reshape(-1, *cost.shape), cost[None]])
+    costs = np.concatenate([np.asarray(costs).reshape(-1, *cost.shape), np.asarray(cost)[None]])
     intervals = np.minimum(np.arange(len(times)) // _PARTS, len(ts) - 2)
     found = _Equations(*in_lanes(_equations, model, times, states, jax.tree.map(lambda x: x[intervals], courses)))
     if not (np.all(np.isfinite(costs)) and np.all(np.isfinite(found.A))):
@@ -165,7 +165,7 @@ def _regulator(plan, model, courses, weights, cost, labels, inputs):
             "Give the plan more intervals, or larger weights of the inputs."
         )
     _check(times, found.regular, found.bound.any(axis=0), labels, inputs)
-    gains = np.swapaxes(found.B, 1, 2) @ costs / weights[1][:, None]
+    gains = np.swapaxes(found.B, 1, 2) @ costs / np.asarray(weights[1])[None, :, None]
     measured = tuple(measured_as(plan.system, name) for name in labels)
     values = found.values.copy()
     for k, own in enumerate(measured):
@@ -254,7 +254,7 @@ def _backward(model, after, courses, weights, cost):
             state, rates = here.moving(t, y[:n])
             equations, P = model.equations(t, state, course), y[n:].reshape(k, k)
             pushed = P @ equations.B
-            change = equations.A.T @ P + P @ equations.A - (pushed / r) @ pushed.T + jnp.diag(q)
+            change = equations.A.T @ P + P @ equations.A - (pushed / r[None, :]) @ pushed.T + jnp.diag(q)
             return jnp.concatenate([rates, -change.reshape(-1)])
 
         def of_part(y, number):

@@ -49,7 +49,8 @@ def lqr(
 
     - `about`: a `Linearisation` with inputs, or a `Plan`.
     - `states`: weights ≥ 0 by name, `{"pin.angle": 10.0, "pin.angle_rate": 1.0}`. Of a linearisation, names of its
-        states; states without a name have weight zero. Along a plan the names must be as many independent coordinates
+        states (under `jit` and `vmap`, of the `coordinates` and `rates` in `linearise`); states without a name have
+        weight zero. Along a plan the names must be as many independent coordinates
         as the machine has, with weight zero if need be; their rates are added where rates are missing.
     - `inputs`: weights > 0 by name: inputs of the linearisation, or controls of the plan, `"push.force[0]"` of a
         vector. Inputs without a name do not change.
@@ -92,8 +93,14 @@ def _at_equilibrium(about: Linearisation, states: dict[str, Any], inputs: dict[s
         raise ValueError("lqr: the linearisation is a batch; call lqr within jax.vmap, as linearise.")
     for kind, given, known in (("state", states, about.states), ("input", inputs, about.inputs)):
         for name in given:
-            if name not in known:
-                raise unknown(kind, name, known, "lqr")
+            if name in known:
+                continue
+            if kind == "state" and is_traced(about.basis):
+                raise ValueError(
+                    f"lqr: Unknown state {name!r}. Under jit and vmap name it in linearise(…, coordinates=, rates=); "
+                    f"here the states are {', '.join(known)}."
+                )
+            raise unknown(kind, name, known, "lqr")
     chosen = np.array([about.inputs.index(name) for name in inputs])
     A, B, dtype = about.A, about.B[:, chosen], about.A.dtype
     q = jnp.stack([jnp.asarray(states.get(name, 0.0), dtype) for name in about.states])

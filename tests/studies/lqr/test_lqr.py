@@ -93,7 +93,7 @@ def test_lqr_gains_have_derivatives_by_lengths_and_weights():
     def gain(length, weight):
         longer = mb.with_parameters(system, {"pin.point_b": jnp.stack([-length, jnp.zeros(())])})
         state = mb.assemble(longer, about.state)
-        linear = mb.linearise(longer, state, inputs=["push.force"], coordinates=NAMES)
+        linear = mb.linearise(longer, state, inputs=["push.force"], coordinates=NAMES, rates=NAMES)
         return mb.lqr(linear, states=WEIGHTS | {"pin.angle": weight}, inputs={"push.force": 0.1}).gains[0, 1]
 
     at, h = (jnp.asarray(0.5), jnp.asarray(100.0)), (1e-4, 1e-2)
@@ -107,14 +107,23 @@ def test_lqr_gains_have_derivatives_by_lengths_and_weights():
 
 
 @pytest.mark.slow
+def test_lqr_tells_how_states_are_named_under_a_trace():
+    system, about = upright()
+
+    def gains(state):
+        linear = mb.linearise(system, state, inputs=["push.force"], coordinates=NAMES)
+        return mb.lqr(linear, **COST).gains
+
+    with pytest.raises(ValueError, match=r"Unknown state 'pin\.angle_rate'\. Under jit and vmap name it in linearise"):
+        jax.eval_shape(gains, about.state)
+
+
+@pytest.mark.slow
 def test_lqr_holds_a_four_bar_at_an_unstable_equilibrium():
-    mechanism = mb.mechanisms.four_bar()
-    scene = mechanism.scene
-    push = mb.JointForce("push", "A.angle", force=0.0)
-    with_push = lambda force: mb.Scene(scene.bodies, joints=scene.joints, forces=[*scene.forces, force]).compile()
-    system = with_push(push)
+    scene = mb.mechanisms.four_bar().scene
+    system = scene.extended(forces=[mb.JointForce("push", "A.angle", force=0.0)]).compile()
     lowest = mb.equilibrium(system)
-    (angle,) = mb.evaluate(system, lowest, ["A.angle"]).values()
+    angle = mb.evaluate(system, lowest, "A.angle")
     for turned in (np.pi, np.pi - 0.5, np.pi + 0.5):
         state = mb.equilibrium(system, mb.assemble(system, lowest, fix={"A.angle": angle + turned}))
         about = mb.linearise(system, state, inputs=["push.force"], coordinates=["A.angle"])
@@ -124,7 +133,7 @@ def test_lqr_holds_a_four_bar_at_an_unstable_equilibrium():
     regulator = mb.lqr(about, states={"A.angle": 100.0, "A.angle_rate": 10.0}, inputs={"push.force": 0.01})
     X = scipy.linalg.solve_continuous_are(about.A, about.B, np.diag([100.0, 10.0]), [[0.01]])
     np.testing.assert_allclose(regulator.gains, about.B.T @ X / 0.01, rtol=1e-10)
-    held = with_push(regulator.controller("hold", {"push.force": "A.angle"}))
+    held = scene.extended(forces=[regulator.controller("hold", {"push.force": "A.angle"})]).compile()
     rest = float(mb.evaluate(system, state, "A.angle"))
     start = mb.assemble(held, state, fix={"A.angle": rest + 0.05})
     end = mb.simulate(held, start, t1=10.0).end
@@ -151,7 +160,7 @@ def test_lqr_refuses_names_and_weights():
     with pytest.raises(ValueError, match="must be a Linearisation or a Plan"):
         mb.lqr(about.A, states=angle, inputs=push)
     regulator = mb.lqr(about, **COST)
-    with pytest.raises(ValueError, match="hold: acts_on has no coordinate for the input 'push.force'"):
+    with pytest.raises(ValueError, match=r"hold: acts_on has no coordinate for the input 'push\.force'"):
         regulator.controller("hold", {})
     with pytest.raises(ValueError, match="hold: Unknown input 'push'"):
         regulator.controller("hold", {"push": "slide.displacement"})
@@ -230,5 +239,5 @@ def test_lqr_along_a_plan_refuses_names():
     ):
         with pytest.raises(ValueError, match=message):
             mb.lqr(plan, states=states, inputs=inputs)
-    with pytest.raises(ValueError, match="lqr: final: Unknown state 'pin.rate'"):
+    with pytest.raises(ValueError, match=r"lqr: final: Unknown state 'pin\.rate'"):
         mb.lqr(plan, states=WEIGHTS, inputs=push, final={"pin.rate": 1.0})
