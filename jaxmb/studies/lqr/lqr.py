@@ -32,7 +32,7 @@ def lqr(
     ```python
     weight, push = jaxmb.Gravity((0.0, -9.81)), jaxmb.JointForce("push", "pin.angle", force=0.0)
     pushed = jaxmb.Scene([bar], joints=[pin], forces=[weight, push]).compile()
-    upright = jaxmb.equilibrium(pushed, jaxmb.assemble(pushed, fix={"bar.angle": np.pi / 2}))
+    upright = jaxmb.equilibrium(pushed, jaxmb.assemble(pushed, fix={"bar.angle": 1.5}), stable=False)
     about = jaxmb.linearise(pushed, upright, inputs=["push.force"], coordinates=["pin.angle"])
     regulator = jaxmb.lqr(about, states={"pin.angle": 10.0, "pin.angle_rate": 1.0}, inputs={"push.force": 0.1})
     hold = regulator.controller("hold", {"push.force": "pin.angle"})

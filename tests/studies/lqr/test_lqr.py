@@ -124,15 +124,17 @@ def test_lqr_holds_a_four_bar_at_an_unstable_equilibrium():
     system = scene.extended(forces=[mb.JointForce("push", "A.angle", force=0.0)]).compile()
     lowest = mb.equilibrium(system)
     angle = mb.evaluate(system, lowest, "A.angle")
-    for turned in (np.pi, np.pi - 0.5, np.pi + 0.5):
-        state = mb.equilibrium(system, mb.assemble(system, lowest, fix={"A.angle": angle + turned}))
-        about = mb.linearise(system, state, inputs=["push.force"], coordinates=["A.angle"])
-        if np.max(about.eigenvalues.real) > 0.1:
-            break
+    opposite = mb.assemble(system, lowest, fix={"A.angle": angle + np.pi})
+    state = mb.equilibrium(system, opposite, stable=False)
+    about = mb.linearise(system, state, inputs=["push.force"], coordinates=["A.angle"])
     assert np.max(about.eigenvalues.real) > 0.1
-    regulator = mb.lqr(about, states={"A.angle": 100.0, "A.angle_rate": 10.0}, inputs={"push.force": 0.01})
+    cost = {"states": {"A.angle": 100.0, "A.angle_rate": 10.0}, "inputs": {"push.force": 0.01}}
+    regulator = mb.lqr(about, **cost)
     X = scipy.linalg.solve_continuous_are(about.A, about.B, np.diag([100.0, 10.0]), [[0.01]])
     np.testing.assert_allclose(regulator.gains, about.B.T @ X / 0.01, rtol=1e-10)
+    rests = {"duration": 1.0, "start": state, "end": state, "running": "effort", "intervals": 4}
+    kept = mb.lqr(mb.plan(system, controls={"push.force": None}, **rests), **cost)
+    np.testing.assert_allclose(kept.gains, np.broadcast_to(regulator.gains, kept.gains.shape), rtol=1e-6)
     held = scene.extended(forces=[regulator.controller("hold", {"push.force": "A.angle"})]).compile()
     rest = float(mb.evaluate(system, state, "A.angle"))
     start = mb.assemble(held, state, fix={"A.angle": rest + 0.05})
