@@ -188,11 +188,13 @@ def _state_names(system, t, state, given) -> tuple[StateNames, tuple[str, ...]]:
     """
     internal = internal_names(system)
     named = [name for name in given if name not in internal]
-    rates = [name for name in named if is_rate(system, t, state, name)]
-    coordinates = tuple(name for name in named if name not in rates)
-    most = counts(system)
-    added = [f"{name}_rate" for name in coordinates if f"{name}_rate" not in rates]
-    rates = (*rates, *added[: max(most[1] - len(rates), 0)])
+    given_rates = [name for name in named if is_rate(system, t, state, name)]
+    coordinates, most = tuple(name for name in named if name not in given_rates), counts(system)
+    of_coordinates = [f"{name}_rate" for name in coordinates]
+    missing = [name for name in of_coordinates if name not in given_rates]
+    added = missing[: max(most[1] - len(given_rates), 0)]
+    others = [name for name in given_rates if name not in of_coordinates]
+    rates = (*(name for name in of_coordinates if name in given_rates or name in added), *others)
     for kind, names, count in zip(("coordinate", "rate"), (coordinates, rates), most, strict=True):
         if len(names) != count:
             listed = ", ".join(names) or "none"

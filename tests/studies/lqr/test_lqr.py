@@ -198,7 +198,9 @@ def test_lqr_along_a_swing_up_brings_a_disturbed_start_to_the_end():
     assert miss(free, 0.02, inputs=plan.controls) > 0.2
     assert miss(held, 0.02) < 0.02
     # The cost of small changes.
-    motion = mb.simulate(held, at_rest(held, pin__angle=DOWN + 1e-3), saveat=np.linspace(0.0, 2.0, 401), rtol=1e-10)
+    motion = mb.simulate(
+        held, at_rest(held, pin__angle=DOWN + 1e-3), t1=2.0, saveat=np.linspace(0.0, 2.0, 401), rtol=1e-10
+    )
     seen = np.stack([np.asarray(motion.quantity(name)) for name in regulator.states], axis=1)
     change = seen - jax.vmap(regulator.reference_states)(motion.ts)
     gains = np.asarray(jax.vmap(mb.Series(regulator.ts, regulator.gains))(motion.ts))
