@@ -1,5 +1,5 @@
 """Studies that simulate a system many times: `identify`, `optimise` and `robust`, `sweep` and `batch`; for small
-motions `linearise`, `root_locus`, `steady_motion` and `floquet`; for a single motion `required_forces` and `loads`. All
+motions `linearise`, `root_locus`, `steady_motion` and `floquet`, and `lqr` for feedback; for a single motion `required_forces` and `loads`. All
 are names of `jaxmb` itself.
 
 ```python

@@ -141,7 +141,7 @@ class Regulator(eqx.Module):
 
         Angles of joints in space take the shortest way to their reference. After the end of a plan the last gains,
         states and inputs hold. The gains and references are parameters of the part, `"name.gains"`, `"name.states"` and
-        `"name.inputs"`.
+        `"name.inputs"`. Planned controls that are `"held"` jump at nodes: `simulate(…, jumps=plan.ts[1:-1])`.
 
         **Arguments:** `name` of the part; `acts_on`: for each input the coordinate that increases with it, and on which
         it acts with the force of the same number, `{"push.force": "slide.displacement"}`.
