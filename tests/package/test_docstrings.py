@@ -200,16 +200,8 @@ LONG = (
     *("shapes", "mechanisms", "mechanisms.ride", "importers", "manifold", "simulate", "Trajectory", "load"),
     *("ContactEvents", "Event", "RESULTS", "identify", "Identification", "Experiment", "optimise", "Optimum"),
     *("robust", "linearise", "Linearisation", "root_locus", "RootLocus", "steady_motion", "floquet", "Floquet"),
-    *(
-        "lqr",
-        "Regulator",
-        "sweep",
-        "mechanisms.Shoes",
-        "viz.show",
-        "viz.plot_root_locus",
-        "report.stress_test",
-        "report.work_precision",
-    ),
+    *("sweep", "mechanisms.Shoes", "viz.show", "viz.plot_root_locus", "report.stress_test", "report.work_precision"),
+    *("lqr", "Regulator"),
     *("formulations.Multipliers", "formulations.NullSpace", "formulations.Poincare", "formulations.UdwadiaKalaba"),
     *(
         "manifold.Baumgarte",
