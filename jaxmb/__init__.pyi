@@ -77,6 +77,7 @@ from .studies.identify import (
 from .studies.optimise import optimise as optimise, Optimum as Optimum, robust as robust
 from .studies.plan import plan as plan, Plan as Plan
 from .studies.plan import plan_phases as plan_phases, Phase as Phase, PhasedPlan as PhasedPlan
+from .studies.lqr import lqr as lqr, Regulator as Regulator
 
 ## Small motions
 from .studies.linear import (

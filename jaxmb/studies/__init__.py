@@ -1,6 +1,6 @@
-"""Studies that simulate a system many times: `identify`, `optimise` and `robust`, `sweep` and `batch`; for small
-motions `linearise`, `root_locus`, `steady_motion` and `floquet`; for a single motion `required_forces` and `loads`. All
-are names of `jaxmb` itself.
+"""Studies that simulate a system many times: `identify`, `optimise` and `robust`, `plan`, `sweep` and `batch`; for
+small motions `linearise`, `root_locus`, `steady_motion` and `floquet`, and `lqr` for feedback; for a single motion
+`required_forces` and `loads`. All are names of `jaxmb` itself.
 
 ```python
 about_rest = jaxmb.linearise(system, jaxmb.equilibrium(system))

@@ -71,6 +71,7 @@ AFTER = {
     "Optimum": "optimise",
     "robust": "optimise",
     "Floquet": "floquet",
+    "Regulator": "lqr",
     "parts.AbstractFlexibleFrame": "parts.AbstractFlexibleBody",
     "planar.ModalFrame": "planar.ElasticBody",
     "viz.plot_root_locus": "root_locus",
@@ -200,6 +201,7 @@ LONG = (
     *("ContactEvents", "Event", "RESULTS", "identify", "Identification", "Experiment", "optimise", "Optimum"),
     *("robust", "linearise", "Linearisation", "root_locus", "RootLocus", "steady_motion", "floquet", "Floquet"),
     *("sweep", "mechanisms.Shoes", "viz.show", "viz.plot_root_locus", "report.stress_test", "report.work_precision"),
+    *("lqr", "Regulator"),
     *("formulations.Multipliers", "formulations.NullSpace", "formulations.Poincare", "formulations.UdwadiaKalaba"),
     *(
         "manifold.Baumgarte",
@@ -248,6 +250,10 @@ def test_examples(name, names, request, tmp_path, monkeypatch):
             # A bar on a pin: the square of its frequency is 3 g / 2 l.
             frequency = np.abs(scope["about_rest"].eigenvalues.imag)
             np.testing.assert_allclose(frequency, np.sqrt(1.5 * 9.81), rtol=1e-9)
+        case "lqr":
+            # An upright bar with 3 g / 2 l = 14.715: the cost X of (angle, rate) solves two quadratic equations.
+            angle, rate = scope["regulator"].gains[0]
+            np.testing.assert_allclose([angle**2 - 9.81 * angle, rate**2 - 2 * angle / 3], [100.0, 10.0], rtol=1e-9)
         case "optimise":
             assert scope["best"].success
             np.testing.assert_allclose(scope["best"].outputs["angle"], 0.0, atol=1e-6)

@@ -140,6 +140,7 @@ CONCRETE = {
     "solvers.tolerances: MultistepNorm",
     "solvers.whole_steps: WithTangents",
     "studies.inverse.required: Trajectory",
+    "studies.lqr.lqr: Plan",
     "studies.sweep.cases: Cases",
     "system.design: Variable",
     "viz.scene: Scene",

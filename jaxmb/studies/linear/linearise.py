@@ -2,9 +2,12 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..._types import Scalar, State
 from ...linalg.arrays import is_traced
@@ -21,6 +24,7 @@ from .perturbations import (
     StateNames,
     check_state_names,
     displacement_names,
+    internal_names,
     rate_candidates,
 )
 from .quantities import components
@@ -83,18 +87,7 @@ def linearise(
     seen = {name: value.shape for name, value in system.quantities().items()}
     chosen, observed = components("input", inputs, shapes), components("output", outputs, seen)
     state = consistent(system, t, dataclasses.replace(state, q=system.normalize(t, state.q)))
-    if system.contacts.m:
-        names = ", ".join(system.contacts.friction_names)
-        raise ValueError(
-            f"linearise: {names} may stick or slip, which no linear equation describes. Remove the friction."
-        )
-    opens = system.contacts.modes(state.q).open
-    if not is_traced(opens) and not np.all(opens):
-        closed = [name for name, is_open in zip(system.contacts.contact_names, opens, strict=True) if not is_open]
-        raise ValueError(
-            f"linearise: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
-            "joints."
-        )
+    opens = check_contacts("linearise", system, state.q)
     equations = linear_equations(system, t, state, names, chosen, observed)
     labels = tuple(_label(item, shapes) for item in chosen), tuple(_label(item, seen) for item in observed)
     matrices = equations.A, equations.B, equations.C, equations.D
@@ -115,6 +108,27 @@ def linearise(
     )
 
 
+def check_contacts(function: str, system: AbstractSystem, q: Any) -> Array:
+    """Whether contacts are open at coordinates, or at all of several along axis 0.
+
+    **Raises:** `ValueError` for dry friction, and for closed contacts unless they are traced.
+    """
+    if system.contacts.m:
+        names = ", ".join(system.contacts.friction_names)
+        raise ValueError(
+            f"{function}: {names} may stick or slip, which no linear equation describes. Remove the friction."
+        )
+    open_at = lambda q: system.contacts.modes(q).open
+    opens = open_at(q) if np.ndim(q) == 1 else jnp.all(jax.vmap(open_at)(q), axis=0)
+    if not is_traced(opens) and not np.all(opens):
+        closed = [name for name, is_open in zip(system.contacts.contact_names, opens, strict=True) if not is_open]
+        raise ValueError(
+            f"{function}: {', '.join(closed)} may open, which no linear equation describes. Replace closed contacts by "
+            "joints."
+        )
+    return opens
+
+
 def state_labels(system: AbstractSystem, names: StateNames, perturbed: Perturbations) -> tuple[str, ...]:
     """The names of the states; numbers for chosen states under a trace, where the choice is unknown."""
     coordinates, rates = perturbed.picked
@@ -126,14 +140,7 @@ def state_labels(system: AbstractSystem, names: StateNames, perturbed: Perturbat
         chosen = tuple(
             [candidates[int(k)] for k in picked] for candidates, picked in zip(lists, perturbed.picked, strict=True)
         )
-    internal = {k: name for name, index in system.state_names().items() for k in index if len(index) == 1}
-    internal |= {
-        k: f"{name}[{place}]"
-        for name, index in system.state_names().items()
-        for place, k in enumerate(index)
-        if len(index) > 1
-    }
-    return (*names.coordinates, *chosen[0], *named_rates, *chosen[1], *(internal[k] for k in range(system.nz)))
+    return (*names.coordinates, *chosen[0], *named_rates, *chosen[1], *internal_names(system))
 
 
 def _rate_label(system, name):

@@ -144,6 +144,28 @@ def rate_function(system: AbstractSystem, t: Scalar, at: State, name: str) -> Ca
     return _quantity(system, t, name, "rate", entries)
 
 
+def is_rate(system: AbstractSystem, t: Scalar, state: State, name: str) -> bool:
+    """Whether a name is a rate's, and not a coordinate's.
+
+    **Raises:** `ValueError` for an unknown name, and for displacements, which are zero at every state.
+    """
+    base, rates = name.removesuffix("_rate"), system.rate_names()
+    if name in rates and len(rates[name]) == 1:
+        return True
+    function = coordinate_function(system, t, None, base)
+    return base != name or _depends_on_velocities(function, state)
+
+
+def internal_names(system: AbstractSystem) -> list[str]:
+    """The names of the internal states in their order, of vectors by component."""
+    names = {
+        k: name if len(index) == 1 else f"{name}[{place}]"
+        for name, index in system.state_names().items()
+        for place, k in enumerate(index)
+    }
+    return [names[k] for k in range(system.nz)]
+
+
 def tangent_basis(system: AbstractSystem, t: Scalar, state: State) -> tuple[Array, Array, Array, Bool[Array, ""]]:
     """The directions of a state on its constraints: of coordinates (nq × kq), with their changes of velocities (nu ×
     kq), and of velocities alone (nu × ku); and whether the constraints have their ranks.
