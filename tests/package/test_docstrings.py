@@ -117,10 +117,16 @@ motor = jaxmb.JointForce("motor", "pin.angle", force=0.0)
 system = jaxmb.Scene([bar], joints=[pin], forces=[motor]).compile()
 """
 BEFORE |= dict.fromkeys(("plan", "Phase", "plan_phases"), MOTOR)
-BEFORE["Plan.objective_of"] = f"""{MOTOR}
+BEFORE["PhasedPlan"] = f"""{MOTOR}
+half = jaxmb.Phase(system, controls={{"motor.force": None}}, duration=0.5, running="effort", intervals=2)
+rest, turned = ({{"pin.angle": angle, "pin.angle_rate": 0.0}} for angle in (0.0, 1.0))
+both = jaxmb.plan_phases([half, half], start=rest, end=turned)
+"""
+BEFORE["Plan"] = BEFORE["Plan.objective_of"] = f"""{MOTOR}
 rest, turned = ({{"pin.angle": angle, "pin.angle_rate": 0.0}} for angle in (0.0, 1.0))
 options = {{"controls": {{"motor.force": None}}, "duration": 1.0, "running": "effort", "intervals": 4}}
 best = jaxmb.plan(system, start=rest, end=turned, **options)
+start = jaxmb.assemble(system)
 """
 BOUNCE = """
 ball = planar.Body("ball", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(0.0, 0.5))

@@ -48,6 +48,11 @@ class Phase:
 class PhasedPlan(Printed):
     """The result of `plan_phases`: a `Plan` for each of the `phases`; `print` shows them.
 
+    ```python
+    print(both)  # For `both` from `plan_phases`.
+    both.objective, both.phases[1].controls["motor.force"]
+    ```
+
     **Fields:** the whole `objective` and `duration` [s]; `iterations`, `success` and `message` as of a `Plan`.
     """
 

@@ -39,6 +39,12 @@ _LIMIT = 300
 class Plan(Printed):
     """An optimal motion, the result of `plan`; `print` shows a table.
 
+    ```python
+    print(best)  # Tables of controls, prices and bounds, for `best` from `plan`.
+    motion = jaxmb.simulate(best.system, start, t1=1.0, inputs=best.controls)
+    best.prices["end pin.angle"], best.derivatives("bar.mass"), best.arrival
+    ```
+
     **Fields:**
 
     - `objective`; `duration` [s]; `ts` [s]: the times of the nodes, and `states` there, stacked along axis 0.
