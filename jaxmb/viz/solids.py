@@ -35,11 +35,17 @@ def solids(
     default a colour each.
     """
     points, width = _attachments(picture), picture.width
+    lines = [
+        (name, *picture.parts[name].bodies) if name in picture.parts else (name,)
+        for name, line in picture.paths.items()
+        if line.kind == "bar"
+    ]
+    in_lines = {name for named in lines for name in named}
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
     for body, shape in picture.shapes:
         of_parts[body].append(shape)
     out: list[Placed] = []
-    for k, name in enumerate(picture.positions):
+    for name in picture.positions:
         if name in given:
             body_shapes = given[name]
             body_shapes = [body_shapes] if isinstance(body_shapes, AbstractShape) else list(body_shapes)
@@ -51,12 +57,25 @@ def solids(
         elif name == GROUND:
             body_shapes = [_support(point, picture.up, width) for point in points[name]]
         else:
-            body_shapes = _linkage(points[name], picture.planar, width)
-            if not body_shapes and not of_parts[name]:
+            body_shapes = [] if name in picture.owners else _linkage(points[name], picture.planar, width)
+            if not body_shapes and name in in_lines:
+                body_shapes = [Sphere(width, color=None if name in picture.paths else DARK)]
+            elif not body_shapes and not of_parts[name] and name in picture.bodies:
                 body_shapes = _equivalent(*picture.inertias[name], width)
-        color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
+        color = _GROUND if name == GROUND else color_in(picture, name, tint)
         out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
     return out
+
+
+def magnified(picture: Picture, deformation: float) -> list[str]:
+    """A note about magnified deformations."""
+    return [f"deformations × {deformation:g}"] if picture.owners and deformation != 1 else []
+
+
+def color_in(picture: Picture, name: str, tint: Color | None = None) -> Color:
+    """The colour of a body, of a frame in it, and of its line; other lines are dark."""
+    body = picture.owners.get(name, name)
+    return tint or COLORS[picture.bodies.index(body) % len(COLORS)] if body in picture.bodies else DARK
 
 
 def _attachments(picture):
