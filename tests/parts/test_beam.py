@@ -494,7 +494,89 @@ def test_frequencies_of_a_turning_chain(space, counts, rtol):
     np.testing.assert_allclose(extrapolated(found), expected, rtol=rtol)
 
 
+def strip_in_bending(n):
+    """A strip along x, tall along z, with a load down at its end: its lowest squared frequency by the load."""
+    section = sections.Section(
+        bending_stiffness=(1e4, 1.0), torsional_stiffness=1.0, axial_stiffness=1e6, shear_stiffness=1e6
+    )
+    own = spatial.beam_chain("b", line(n, 1.0, 3), section, mass=1.0, y=(0.0, 1.0, 0.0), inextensible=True)
+    load = spatial.PointForce("load", f"b_node{n}", force=np.zeros(3))
+    system = mb.Scene(own.bodies, joints=own.joints, forces=[*own.forces, load]).compile()
+
+    @jax.jit
+    def lowest(load):
+        loaded = mb.with_parameters(system, {"load.force": jnp.array([0.0, 0.0, -1.0]) * load})
+        values = mb.linearise(loaded, mb.equilibrium(loaded)).eigenvalues
+        return -(values[0] ** 2).real
+
+    return lowest
+
+
+@pytest.mark.slow
+def test_lateral_buckling_of_a_strip():
+    """Prandtl's load of a cantilever strip, 4.0125985 √(EI GJ) / L² (S. P. Timoshenko and J. M. Gere, "Theory of
+    Elastic Stability", McGraw-Hill 1961, section 6.3).
+    """
+    found = []
+    for n in (4, 8):
+        lowest, a, b = strip_in_bending(n), 4.0, 4.2
+        x, y = float(lowest(a)), float(lowest(b))
+        for _ in range(4):
+            a, b, x = b, b - y * (b - a) / (y - x), y
+            y = float(lowest(b))
+        found.append(b)
+    np.testing.assert_allclose(extrapolated(found), 4.0125985, rtol=2e-3)
+
+
 # Section forces, motions and derivatives
+
+
+@pytest.mark.slow
+def test_spin_up():
+    """The largest lag of the tip of a blade that spins up (T. R. Kane, R. R. Ryan, A. K. Banerjee 1987; J. C. Simo,
+    L. Vu-Quoc 1986), a chain of hinged bars with springs: -0.574 after extrapolation.
+    """
+    length, mass, stiffness = 10.0, 12.0, 1.4e4
+    angle = lambda t, p: 0.4 * (t**2 / 2 + (7.5 / np.pi) ** 2 * (jnp.cos(np.pi * t / 7.5) - 1))
+    found = []
+    for n in (4, 8):
+        section = sections.Section(bending_stiffness=stiffness)
+        own = planar.beam_chain("b", line(n, length), section, mass=mass, ends=("hub", None), inextensible=True)
+        hub = planar.Body("hub", mass=1.0, inertia=1.0)
+        joints = [
+            planar.Revolute("axle", "ground", "hub", point=(0.0, 0.0)),
+            planar.Driver("drive", "ground", "hub", quantity="angle", motion=angle),
+        ]
+        system = mb.Scene([hub, *own.bodies], joints=[*joints, *own.joints], forces=own.forces).compile()
+        ts = np.linspace(6.0, 7.5, 61)
+        motion = mb.simulate(
+            system, mb.assemble(system), t1=7.5, saveat=ts, rtol=1e-6, solver=mb.solvers.Hermite(), max_steps=20000
+        )
+        tip, turn = np.asarray(motion[f"b_node{n}"].position), np.asarray(motion["hub"].angle)
+        found.append(np.min(np.cos(turn) * tip[:, 1] - np.sin(turn) * tip[:, 0]))
+    np.testing.assert_allclose(extrapolated(found), -0.574, rtol=0, atol=3e-3)
+
+
+@pytest.mark.slow
+def test_pendulum_bends_as_an_elastic_bar():
+    """A bar of two modes falls from the horizontal, against chains of inextensible beams."""
+    bar = {"length": 1.0, "width": 0.02, "thickness": 0.02}
+    young, density, fall = 1e8, 1000.0, mb.Gravity((0.0, -9.81))
+    at = {"point_a": (0.0, 0.0), "point_b": (0.0, 0.0)}
+    rod = planar.ElasticBar("rod", young=young, density=density, bending=3, **bar)
+    hung = planar.Revolute("pin", "ground", "rod", **at)
+    single = mb.Scene([rod], joints=[hung], forces=[fall], frames=[planar.BarFrame("tip", "rod")]).compile()
+    end = lambda system, name: np.asarray(
+        mb.simulate(system, mb.assemble(system), t1=0.3, rtol=1e-8).quantity(f"{name}.position")[-1]
+    )
+    section = sections.Rectangle(thickness=0.02, width=0.02, modulus=young, poisson_ratio=0.3)
+    found = []
+    for n in (4, 8):
+        own = planar.beam_chain("b", line(n), section, mass=0.4, ends=(None, None), inextensible=True)
+        pin = planar.Revolute("pin", "ground", "b_node0", **at)
+        found.append(end(mb.Scene(own.bodies, joints=[pin, *own.joints], forces=[fall]).compile(), f"b_node{n}"))
+    expected = end(single, "tip")
+    np.testing.assert_allclose(extrapolated(found), expected, rtol=0, atol=1e-3)
 
 
 @pytest.mark.slow
