@@ -61,6 +61,7 @@ def picture(
             name: np.asarray(space.in_space(centre)) for g in system.bodies.groups for name, centre in _centres(g.group)
         },
         inertias={name: (float(m), J) for name, m, J in zip(moving, mass, moments, strict=False)},
+        notes=(f"deformations × {deformation:g}",) if owners and deformation != 1 else (),
     )
 
 

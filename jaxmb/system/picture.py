@@ -35,6 +35,7 @@ class Picture(NamedTuple):
     - `bodies`: the names of the moving bodies; `owners`: by name of such a frame, its body.
     - `parts` by name; `shapes` of parts, with the names of their bodies; `paths` of parts and of flexible bodies.
     - `centres` [m]: mass centres in the bodies' frames, of bodies with their origin elsewhere.
+    - `notes`: words about the picture, such as the scale of deformations.
     - `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies by name, zero for point masses.
     """
 
@@ -50,6 +51,13 @@ class Picture(NamedTuple):
     paths: dict[str, Line]
     centres: dict[str, Float[np.ndarray, "3"]]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def on_bars(self) -> set[str]:
+        """Names of the bodies that thick lines show."""
+        bars = [name for name, line in self.paths.items() if line.kind == "bar"]
+        return {body for name in bars for body in (self.parts[name].bodies if name in self.parts else (name,))}
 
 
 def joined_pictures(pictures: Sequence[Picture]) -> Picture:

@@ -17,7 +17,7 @@ from ..trajectory import Trajectory
 from . import scenery
 from .motion_nodes import Motion, check_shapes, chosen, motion
 from .one_motion import as_motion
-from .solids import COLORS, magnified
+from .solids import COLORS
 from .stage import SceneNode, page
 
 Shown = Trajectory | State
@@ -135,7 +135,7 @@ def show(
     background, clock = scenery.nodes(motions, view), np.unique(np.concatenate([single.times for single in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
     notes += [f"arrows {square:g} N a square"] if square else []
-    notes += dict.fromkeys(note for single in motions for note in magnified(single.picture, deformation))
+    notes += dict.fromkeys(note for single in motions for note in single.picture.notes)
     played += [
         (np.zeros(1), background),
         ((clock - first) / speed, [scenery.clock(clock, notes, _marks(motions, clock, speed), view)]),

@@ -19,7 +19,7 @@ from .figure import color as color_of, new_figure
 from .meshes import heights
 from .one_motion import check_finite, one_motion, poses_of
 from .silhouettes import area, edges, strip, stroke
-from .solids import Placed, color_in, magnified, solids
+from .solids import Placed, color_in, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +81,7 @@ def plot_mechanism(
         figure.legend(loc="outside right upper", fontsize="small")
     finish(figure, axes, picture, shapes)
     title = "t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s" if len(shown) <= _TIMES else ""
-    axes.set_title("  ·  ".join(filter(None, [title, *magnified(picture, deformation)])), fontsize="medium")
+    axes.set_title("  ·  ".join(filter(None, [title, *picture.notes])), fontsize="medium")
     return figure
 
 

@@ -15,7 +15,7 @@ from ..trajectory import Trajectory, picture_of
 from .mechanism import drawn, faded, finish, in_world
 from .motion_nodes import chosen
 from .silhouettes import area, edges
-from .solids import COLORS, magnified, solids
+from .solids import COLORS, solids
 
 # A motion takes at least and at most so many seconds, if no speed is given. A frame takes a multiple of `_TICK` s.
 _SHORTEST, _LONGEST, _TICK = 2.0, 20.0, 0.01
@@ -69,9 +69,7 @@ def save_movie(
     picture, times = picture_of(motion, deformation), np.asarray(motion.ts)
     lasts = float(times[-1] - times[0])
     lasts = float(np.clip(lasts, _SHORTEST, _LONGEST)) if speed is None else lasts / speed
-    _WRITERS[path.suffix](
-        path, _drawn(picture, times, trails, magnified(picture, deformation)), lasts / (times.size - 1)
-    )
+    _WRITERS[path.suffix](path, _drawn(picture, times, trails), lasts / (times.size - 1))
     return path
 
 
@@ -96,7 +94,7 @@ def _write_mp4(path, images, duration):
 _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
-def _drawn(picture: Picture, times: np.ndarray, trails: bool, notes: list[str]) -> Iterator[io.BytesIO]:
+def _drawn(picture: Picture, times: np.ndarray, trails: bool) -> Iterator[io.BytesIO]:
     shapes = solids(picture, {}, None)
     low, high = _bounds(picture, shapes, times.size)
     dimension = 2 if picture.planar else 3
@@ -110,7 +108,9 @@ def _drawn(picture: Picture, times: np.ndarray, trails: bool, notes: list[str]) 
         axes.set(**limits)
         finish(figure, axes, picture, shapes)
         axes.set(**limits)
-        axes.set_title("  ·  ".join([f"t = {t - times[0]:.2f} s", *notes]), fontsize="medium", family="monospace")
+        axes.set_title(
+            "  ·  ".join([f"t = {t - times[0]:.2f} s", *picture.notes]), fontsize="medium", family="monospace"
+        )
         file = io.BytesIO()
         figure.savefig(file, dpi=_DPI)
         file.seek(0)

@@ -34,13 +34,7 @@ def solids(
     **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
     default a colour each.
     """
-    points, width = _attachments(picture), picture.width
-    lines = [
-        (name, *picture.parts[name].bodies) if name in picture.parts else (name,)
-        for name, line in picture.paths.items()
-        if line.kind == "bar"
-    ]
-    in_lines = {name for named in lines for name in named}
+    points, width, on_bars = _attachments(picture), picture.width, picture.on_bars
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
     for body, shape in picture.shapes:
         of_parts[body].append(shape)
@@ -58,18 +52,13 @@ def solids(
             body_shapes = [_support(point, picture.up, width) for point in points[name]]
         else:
             body_shapes = [] if name in picture.owners else _linkage(points[name], picture.planar, width)
-            if not body_shapes and name in in_lines:
+            if not body_shapes and name in on_bars:
                 body_shapes = [Sphere(width, color=None if name in picture.paths else DARK)]
             elif not body_shapes and not of_parts[name] and name in picture.bodies:
                 body_shapes = _equivalent(*picture.inertias[name], width)
         color = _GROUND if name == GROUND else color_in(picture, name, tint)
         out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
     return out
-
-
-def magnified(picture: Picture, deformation: float) -> list[str]:
-    """A note about magnified deformations."""
-    return [f"deformations × {deformation:g}"] if picture.owners and deformation != 1 else []
 
 
 def color_in(picture: Picture, name: str, tint: Color | None = None) -> Color:
