@@ -686,9 +686,10 @@ def at_rows(trajectory: Trajectory, rows: Int[np.ndarray, "n"]) -> Trajectory:
     return changed(trajectory, ts=ts, ys=ys, stages=tuple(reversed(stages) if backward else stages))
 
 
-def picture_of(trajectory: Trajectory) -> Picture:
-    """The bodies and parts of a single motion, for a picture."""
-    pictures = [run.system.catalogue.picture(run.ts, states_of(run)) for run in trajectory.stages or (trajectory,)]
+def picture_of(trajectory: Trajectory, deformation: float = 1.0) -> Picture:
+    """The bodies and parts of a single motion, for a picture; `deformation` magnifies that of flexible bodies."""
+    stages = trajectory.stages or (trajectory,)
+    pictures = [run.system.catalogue.picture(run.ts, states_of(run), deformation) for run in stages]
     return pictures[0] if len(pictures) == 1 else joined_pictures(pictures)
 
 

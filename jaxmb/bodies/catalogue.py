@@ -84,9 +84,9 @@ class SceneCatalogue(Catalogue):
         place = places(self.system.forces.groups, name), places(self.system.constraints.nonideal, name)
         return applied_wrenches(self.system, place, ts, ys, multipliers)
 
-    def picture(self, ts, ys):
+    def picture(self, ts, ys, deformation=1.0):
         acting = (*self.system.constraints.groups, *self.system.forces.groups)
-        return picture(self.system, [g.group for g in acting], ts, ys)
+        return picture(self.system, [g.group for g in acting], ts, ys, deformation)
 
     def limits(self, t, q):
         space, poses, out = self.system.layout.space, np.asarray(self.system.bodies.prepared_poses(q)), []

@@ -1,5 +1,6 @@
 """The picture of a motion: poses of the bodies, and shapes and points of the parts."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,29 +12,30 @@ from jaxtyping import Array, Float
 
 from .._types import State
 from ..parts.base import GROUND
-from ..system.picture import Anchors, Line, Picture
-from .groups import Group
+from ..system.picture import Anchors, Line, Picture, in_space
+from .groups import FrameGroup, Group
 
 
-def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State) -> Picture:
-    """The picture of a system of bodies and of stacked parts."""
-    layout, names = system.layout, (*system.body_names, GROUND)
+def picture(
+    system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys: State, deformation: float = 1.0
+) -> Picture:
+    """The picture of a system of bodies and of stacked parts, with magnified deformations of flexible bodies."""
+    layout, moving = system.layout, tuple(system.body_names)
     space, groups = layout.space, [_pictured(group) for group in groups]
     # Scalar coordinates have no place in the picture.
-    body_names = dict(zip((*range(layout.bodies), layout.ground), names, strict=True))
-    position, orientation = (np.asarray(values)[list(body_names)] for values in _placements(system, ys))
-    single = [
-        (name, tuple(body_names[body] for body in bodies if body in body_names), part)
-        for group in groups
-        for name, bodies, part in zip(group.names, group.bodies, _unstacked(group), strict=True)
-    ]
+    body_names = dict(zip((*range(layout.bodies), layout.ground), (*moving, GROUND), strict=True))
+    single = [one for group in groups for one in _parts(group, body_names)]
+    owners = {name: moving[of[0]] for g in _flexible_frames(system) for name, of in zip(g.names, g.bodies, strict=True)}
+    joints = {name for g in system.constraints.groups for name in g.group.names}
+    held = {owners[frame] for name, of, _ in single if name in joints for frame in of if frame in owners}
+    positions, orientations, lines = _places(system, ts, ys, owners, held, deformation)
     parts: dict[str, Anchors] = {}
     for name, bodies, part in single:
         points = [part.anchor(space, k) for k in range(len(bodies))]
         parts.setdefault(
             name, Anchors(bodies, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
         )
-    width = _width(float(system.length), parts, dict(zip(names, position[:, 0], strict=True)))
+    width = _width(float(system.length), parts, {name: at[0] for name, at in positions.items()}, owners)
     shapes = [
         (GROUND if k is None else bodies[k], shape)
         for _, bodies, part in single
@@ -48,15 +50,18 @@ def picture(system: Any, groups: Sequence[Group], ts: Float[Array, "times"], ys:
         planar=not system.spatial,
         up=_up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity)),
         width=width,
-        positions=dict(zip(names, position, strict=True)),
-        orientations=dict(zip(names, orientation, strict=True)),
+        positions=positions,
+        orientations=orientations,
+        bodies=moving,
+        owners=owners,
         parts=parts | {law: parts[joint] for law, joint in of_laws.items()},
         shapes=shapes,
-        paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()},
+        paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()} | lines,
         centres={
             name: np.asarray(space.in_space(centre)) for g in system.bodies.groups for name, centre in _centres(g.group)
         },
-        inertias={name: (float(m), J) for name, m, J in zip(names, mass, moments, strict=False)},
+        inertias={name: (float(m), J) for name, m, J in zip(moving, mass, moments, strict=False)},
+        notes=(f"deformations × {deformation:g}",) if owners and deformation != 1 else (),
     )
 
 
@@ -82,19 +87,35 @@ def _centres(group):
     return () if given is None else zip(group.names, np.asarray(given), strict=True)
 
 
-def _unstacked(group):
-    """The parts of a group, with numbers in NumPy."""
+def _parts(group, body_names):
+    """Names, bodies and parts of a group, with numbers in NumPy. A frame that moves in a flexible body counts as a
+    body, and its part sees it alone.
+    """
     stacked = jax.tree.map(np.asarray, group.part)
-    return [jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(group.names))]
+    moving = [k for k, frame in stacked.body_frames.items() if frame.is_flexible]
+    if moving:
+        fixed = {k: frame for k, frame in stacked.body_frames.items() if k not in moving}
+        stacked = stacked.with_fields(body_frames=fixed)
+    for member, (name, bodies) in enumerate(zip(group.names, group.bodies, strict=True)):
+        named = {k: body_names[body] for k, body in enumerate(bodies) if body in body_names}
+        named |= {int(k): dict(group.inner)["body_frames", k][member] for k in moving}
+        yield name, tuple(named.values()), jax.tree.map(lambda leaf, k=member: leaf[k], stacked)
 
 
-def _width(length, parts, places):
+def _flexible_frames(system):
+    """Groups of frames that move in flexible bodies."""
+    return [g.group for g in system.frames if g.group.part.is_flexible]
+
+
+def _width(length, parts, places, owners):
     """The radius of a bar, from the sizes of the system and of a typical body; of points, from their distances."""
     reach: dict[str, float] = {}
     for part in parts.values():
         for body, point in zip(part.bodies, part.points, strict=True):
             if point is not None and body != GROUND:
-                reach[body] = max(reach.get(body, 0.0), float(np.linalg.norm(point)))
+                owner = owners.get(body, body)
+                away = np.linalg.norm(point) + np.linalg.norm(places[body] - places[owner])
+                reach[owner] = max(reach.get(owner, 0.0), float(away))
     joined = [part.bodies for part in parts.values() if len(part.bodies) == 2 and GROUND not in part.bodies]
     halves = [0.5 * float(np.linalg.norm(places[a] - places[b])) for a, b in joined]
     sizes = [distance for distance in reach.values() if distance > 0] or [half for half in halves if half > 0]
@@ -106,16 +127,60 @@ def _paths(system, group, ts, ys) -> dict[str, Line]:
     lines = _world_paths(system, group, ts, ys)
     if lines is None:
         return {}
-    lines = np.asarray(lines)
-    lines = np.concatenate([lines, np.zeros((*lines.shape[:-1], 3 - lines.shape[-1]))], axis=-1)
+    lines = in_space(lines)
     return {name: Line(group.part.path_kind or "rod", lines[:, k]) for k, name in enumerate(group.names)}
 
 
+def _places(system, ts, ys, owners, held, deformation):
+    """Positions and orientations of bodies, ground and flexible frames, and lines of flexible bodies, by name.
+
+    Deformations are magnified from the undeformed body, or from the chord where joints have `held` its frames.
+    """
+    names: list[str] = [*system.body_names, GROUND, *owners]
+    position, orientation, lines = _named_places(system, names, ts, ys.q)
+    if owners and deformation != 1:
+        modal = [system.layout.pose_index[g.body_index[:, 1:], 0].ravel() for g in _flexible(system)]
+        at_rest, _, rest = _named_places(system, names, ts, ys.q.at[:, np.concatenate(modal)].set(0.0))
+        grown = lambda base, to: base + deformation * (to - base)
+        position |= {name: grown(at_rest[name], position[name]) for name in owners if owners[name] not in held}
+        for name, line in lines.items():
+            share = np.linspace(0.0, 1.0, line.shape[1])[:, None]
+            lines[name] = grown(
+                line[:, :1] + share * (line[:, -1:] - line[:, :1]) if name in held else rest[name], line
+            )
+    # Other flexible bodies are straight lines to their frames.
+    for name in dict.fromkeys(owners.values()):
+        ends = [x for frame, owner in owners.items() if owner == name for x in (position[name], position[frame])]
+        lines.setdefault(name, np.stack(ends, axis=1))
+    return position, orientation, {name: Line("bar", points) for name, points in lines.items()}
+
+
+def _flexible(system):
+    return [g.group for g in system.bodies.groups if g.is_flexible]
+
+
+def _named_places(system, names, ts, q):
+    position, orientation, lines = _placements(system, ts, q)
+    of_groups = [(g, in_space(x)) for g, x in zip(_flexible(system), lines, strict=True) if x is not None]
+    named = {name: x[:, k] for g, x in of_groups for k, name in enumerate(g.names)}
+    by_name = lambda values: dict(zip(names, np.asarray(values).swapaxes(0, 1), strict=True))
+    return by_name(position), by_name(orientation), named
+
+
 @eqx.filter_jit
-def _placements(system, ys):
-    poses = jax.vmap(system.bodies.prepared_poses)(ys.q)
-    position, orientation = jax.vmap(jax.vmap(system.layout.space.placement))(poses)
-    return jnp.swapaxes(position, 0, 1), jnp.swapaxes(orientation, 0, 1)
+def _placements(system, ts, q):
+    """Positions and orientations of bodies, ground and flexible frames, and of points of flexible bodies in lines."""
+    space, places = system.layout.space, np.append(np.arange(system.layout.bodies), system.layout.ground)
+
+    def at_time(t, q):
+        poses = system.bodies.prepared_poses(q)
+        frames = [FrameGroup(g).poses(t, poses) for g in _flexible_frames(system)]
+        in_world = lambda pose, line: None if line is None else jax.vmap(functools.partial(space.point, pose))(line)
+        line = lambda at, x: in_world(x[0], at(t).line(space, x[1:, 0]))
+        lines = [g.map(line, g.gather(poses)) for g in _flexible(system)]
+        return *jax.vmap(space.placement)(jnp.concatenate([poses[places], *frames])), lines
+
+    return jax.vmap(at_time)(ts, q)
 
 
 @eqx.filter_jit

@@ -66,7 +66,7 @@ def bar_tables(bending: int, stretch: int, twist: int) -> BarTables:
     return BarTables(counts, coefficients, stations, weights, shapes, (*stiffness, twisting))
 
 
-def shapes_at(tables: BarTables, stations: Float[Array, "s"]) -> BarShapes:
+def shapes_at(tables: BarTables, stations: Float[Array | np.ndarray, "s"]) -> BarShapes:
     """The values at stations."""
     return _shapes(tables.counts, tables.coefficients, stations)
 

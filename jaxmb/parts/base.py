@@ -43,7 +43,7 @@ Wrenches = Float[Array, "k v"]
 GROUND = "ground"
 
 # How a picture draws the line of a part.
-PathKind = Literal["rod", "coil", "belt"]
+PathKind = Literal["rod", "coil", "belt", "bar"]
 # The quantity of each coordinate by name: an angle [rad], a rotation vector [rad] or a length [m].
 Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
@@ -286,6 +286,13 @@ class AbstractFlexibleBody(AbstractBody):
         """Hook: generalized forces along ζ that no energy stores, such as damping."""
         del space, rates
         return jnp.zeros_like(zeta)
+
+    def line(self, space: AbstractSpace, zeta: Float[Array, "k"]) -> Float[Array, "points d"] | None:
+        """Hook: points [m] in the body's frame of the deformed line by which a picture shows it; by default it is shown
+        by straight lines to its frames.
+        """
+        del space, zeta
+        return None
 
     def scalar_coordinates(self) -> tuple[ScalarCoordinate, ...]:
         """The modal coordinates by their names in the scene."""
@@ -605,8 +612,8 @@ class AbstractLink(AbstractActor):
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
         """Hook: the world points [m] of the line by which a picture shows the part; None without a line.
 
-        By `path_kind`, `"rod"` (also for None) and `"coil"` have two points; `"belt"` is a closed line through any
-        number of points.
+        By `path_kind`, `"rod"` (also for None) and `"coil"` have two points; `"bar"` is a line, as thick as a body, and
+        `"belt"` a closed line, through any number of points.
         """
         return None if self.path_kind is None else both_points(space, self, poses)
 

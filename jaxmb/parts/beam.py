@@ -14,7 +14,7 @@ from .base import AbstractConstraint, AbstractPointPair, AbstractPotentialForce,
 from .forces import generalized_force
 from .planar.joints import relative_angle
 from .sections import AbstractSection
-from .space import rate_of, separation
+from .space import both_points, rate_of, separation
 from .spatial.axes import offset_in_a, relative_orientation, shortest_turn
 
 
@@ -49,7 +49,7 @@ class AbstractBeam(AbstractPointPair):
     moving: ClassVar[tuple[str, ...]] = (
         *("length", "angle_a", "angle_b", "orientation_a", "orientation_b", "free_strain", "free_curvature"),
     )
-    path_kind: ClassVar[PathKind] = "rod"
+    path_kind: ClassVar[PathKind] = "bar"
     # Whether stretch and shear store energy.
     extends: ClassVar[bool]
 
@@ -91,6 +91,19 @@ class AbstractBeam(AbstractPointPair):
         turn = rot.multiply(turn, self.orientation_b)
         in_a = rot.unrotate(self.orientation_a, offset_in_a(space, self, poses))
         return rot.unrotate(rot.half_turn(turn), in_a) / self.length, rot.rotation_vector(turn) / self.length
+
+    def path(self, space, poses):
+        # The cubic curve along the sections' x axes.
+        a, b = both_points(space, self, poses)
+        along = np.eye(space.dimension)[0]
+        if space.dimension == 2:
+            in_bodies = [rot.rotate_2d(angle, along) for angle in (self.angle_a, self.angle_b)]
+        else:
+            in_bodies = [rot.rotate(turn, along) for turn in (self.orientation_a, self.orientation_b)]
+        ends = [space.direction(x, axis) for x, axis in zip(poses, in_bodies, strict=True)]
+        chord, s = b - a, np.linspace(0.0, 1.0, 9)
+        start, end = (rot.norm(chord) * axis - chord for axis in ends)
+        return a[None] + jnp.outer(s, chord) + jnp.outer(s * (1 - s) ** 2, start) - jnp.outer(s**2 * (1 - s), end)
 
     def deformations(self, space: Any, poses: Float[Array, "2 p"]) -> tuple[Float[Array, "d"], Array]:
         """The strains less those without a force."""

@@ -39,6 +39,8 @@ _TURNS = {
 _INDEPENDENT = 1e-12
 _MOST_MODES = 8
 _RECTANGLE = ("width", "thickness")
+# The stations by which a picture shows a bar.
+_SHOWN = np.linspace(0.0, 1.0, 17)
 
 
 class ElasticNumbers(eqx.Module):
@@ -375,6 +377,10 @@ class AbstractElasticBar(AbstractElastic):
         """The place [m] of a section in the body's frame, and its turn [rad]."""
         shapes = shapes_at(self._tables, station[None])
         return self._line(shapes, station[None], zeta)[0], self._section_turns(shapes)[0] @ zeta
+
+    def line(self, space, zeta):
+        del space
+        return self._line(shapes_at(self._tables, _SHOWN), _SHOWN, zeta)
 
     def strain(self, station: Any, offset: Float[Array, "directions"], zeta: Float[Array, "n"]) -> Float[Array, ""]:
         """The strain along the bar at a place of the section [m] across it."""

@@ -125,8 +125,8 @@ class Catalogue:
         """
         raise ValueError(_NO_FORCES)
 
-    def picture(self, ts: Float[Array, "times"], ys: State) -> Picture:
-        """The bodies and parts in a picture.
+    def picture(self, ts: Float[Array, "times"], ys: State, deformation: float = 1.0) -> Picture:
+        """The bodies and parts in a picture, where flexible bodies have `deformation` times their deformation.
 
         **Raises:** `ValueError` for a system without bodies.
         """

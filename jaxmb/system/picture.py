@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from ..parts.base import PathKind
 from ..parts.shapes import AbstractShape
@@ -30,10 +30,12 @@ class Picture(NamedTuple):
     **Fields:**
 
     - `planar`; `up`, the unit vector that is upright in the picture; `width` [m]: the radius of a bar.
-    - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), of the bodies by name;
-        the ground is last.
-    - `parts` by name; `shapes` of parts, with the names of their bodies; `paths` of parts by name.
+    - `positions` [m], shape (times, 3), and `orientations`, Euler parameters, shape (times, 4), by name, of the bodies,
+        the ground, and frames that move in flexible bodies.
+    - `bodies`: the names of the moving bodies; `owners`: by name of such a frame, its body.
+    - `parts` by name; `shapes` of parts, with the names of their bodies; `paths` of parts and of flexible bodies.
     - `centres` [m]: mass centres in the bodies' frames, of bodies with their origin elsewhere.
+    - `notes`: words about the picture, such as the scale of deformations.
     - `inertias`: mass [kg] and moments of inertia [kg m²], shape (3, 3), of the bodies by name, zero for point masses.
     """
 
@@ -42,11 +44,20 @@ class Picture(NamedTuple):
     width: float
     positions: dict[str, Float[np.ndarray, "times 3"]]
     orientations: dict[str, Float[np.ndarray, "times 4"]]
+    bodies: tuple[str, ...]
+    owners: dict[str, str]
     parts: dict[str, Anchors]
     shapes: list[tuple[str, AbstractShape]]
     paths: dict[str, Line]
     centres: dict[str, Float[np.ndarray, "3"]]
     inertias: dict[str, tuple[float, Float[np.ndarray, "3 3"]]]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def on_bars(self) -> set[str]:
+        """Names of the bodies that thick lines show."""
+        bars = [name for name, line in self.paths.items() if line.kind == "bar"]
+        return {body for name in bars for body in (self.parts[name].bodies if name in self.parts else (name,))}
 
 
 def joined_pictures(pictures: Sequence[Picture]) -> Picture:
@@ -59,3 +70,9 @@ def joined_pictures(pictures: Sequence[Picture]) -> Picture:
         orientations=follow([own.orientations for own in pictures]),
         paths={name: line._replace(points=points[name]) for name, line in last.paths.items()},
     )
+
+
+def in_space(vectors: ArrayLike) -> Float[np.ndarray, "*vectors 3"]:
+    """Vectors of the plane or of space with three components."""
+    vectors = np.asarray(vectors)
+    return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 3 - vectors.shape[-1]))], axis=-1)

@@ -66,6 +66,7 @@ def show(
     speed: float | None = None,
     overlay: bool = False,
     height: int = 480,
+    deformation: float = 1.0,
     system: AbstractSystem | None = None,
 ) -> MovingPicture:
     """Make a moving picture of one or several motions, for a notebook or saved as a page.
@@ -95,7 +96,7 @@ def show(
     - `speed` of playing, 1 for real time. By default motions play in real time, but for at least 2 s and at most a
         minute. The slider shows the playing time, the picture the time of the motion.
     - `overlay`: show several motions in one place, each in a colour, instead of side by side.
-    - `height` [pixels], in a notebook.
+    - `height` [pixels], in a notebook; `deformation` as in `plot_mechanism`.
     - `system`: of states, which are shown in place of motions: `show(state, system=system)`.
 
     **Returns:** a `MovingPicture`, of about 0.8 MB and more for long motions of many bodies.
@@ -114,7 +115,7 @@ def show(
     for single in named.values():
         check_shapes(single.system, shapes)
     motions = [
-        motion(name, chosen(single, frames, least), shapes, COLORS[k % len(COLORS)] if overlay else None)
+        motion(name, chosen(single, frames, least), shapes, COLORS[k % len(COLORS)] if overlay else None, deformation)
         for k, (name, single) in enumerate(named.items())
     ]
     forces_of = [_arrows(single, reactions, forces) for single in motions]
@@ -134,6 +135,7 @@ def show(
     background, clock = scenery.nodes(motions, view), np.unique(np.concatenate([single.times for single in motions]))
     notes = [f"{speed:.3g} × real time"] if speed != 1 else []
     notes += [f"arrows {square:g} N a square"] if square else []
+    notes += dict.fromkeys(note for single in motions for note in single.picture.notes)
     played += [
         (np.zeros(1), background),
         ((clock - first) / speed, [scenery.clock(clock, notes, _marks(motions, clock, speed), view)]),

@@ -10,7 +10,7 @@ from .._arguments import whole_number
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
-from ..parts.shapes import DARK, GROUND as GROUND_COLOR, Color
+from ..parts.shapes import GROUND as GROUND_COLOR, Color
 from ..studies.inverse import RequiredForces
 from ..system import AbstractSystem
 from ..system.picture import Picture
@@ -18,8 +18,8 @@ from ..trajectory import Trajectory, picture_of
 from .figure import color as color_of, new_figure
 from .meshes import heights
 from .one_motion import check_finite, one_motion, poses_of
-from .silhouettes import area, edges, stroke
-from .solids import Placed, solids
+from .silhouettes import area, edges, strip, stroke
+from .solids import Placed, color_in, solids
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +34,11 @@ _EDGE: Color = (40, 40, 40)
 
 
 def plot_mechanism(
-    trajectory: Trajectory | RequiredForces | State, frames: int = 5, *, system: AbstractSystem | None = None
+    trajectory: Trajectory | RequiredForces | State,
+    frames: int = 5,
+    *,
+    system: AbstractSystem | None = None,
+    deformation: float = 1.0,
 ) -> "Figure":
     """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres; or
     at one state.
@@ -49,7 +53,8 @@ def plot_mechanism(
     the terrain. Up to 8 bodies have paths and a legend.
 
     **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State`, with its `system`; `frames`: the
-    number of poses, at least 1.
+    number of poses, at least 1; `deformation`: the factor by which deformations of elastic bars and bodies are
+    magnified, from the chord of a bar that a joint holds at another point than its origin.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
@@ -65,21 +70,20 @@ def plot_mechanism(
         )
     trajectory = one_motion(trajectory, "plot_mechanism", 1)
     check_finite(trajectory)
-    picture = picture_of(trajectory)
+    picture = picture_of(trajectory, deformation)
     shapes = solids(picture, {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
     figure, axes = drawn(picture, shapes, shown.tolist())
-    bodies = [name for name in picture.positions if name != GROUND]
-    if len(bodies) <= _FEW:
-        for k, name in enumerate(bodies):
+    if len(picture.bodies) <= _FEW:
+        for k, name in enumerate(picture.bodies):
             path, color = picture.positions[name][:, : 2 if picture.planar else 3], color_of(k)
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")
     finish(figure, axes, picture, shapes)
-    if len(shown) <= _TIMES:
-        axes.set_title("t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s", fontsize="medium")
+    title = "t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s" if len(shown) <= _TIMES else ""
+    axes.set_title("  ·  ".join(filter(None, [title, *picture.notes])), fontsize="medium")
     return figure
 
 
@@ -134,9 +138,14 @@ def _draw_edges(axes, picture, shapes, time, fade):
 
 
 def _draw_paths(axes, picture, time, fade):
-    for line in picture.paths.values():
+    for name, line in picture.paths.items():
+        color = faded(color_in(picture, name), fade)
+        if line.kind == "bar" and picture.planar:
+            for corners in strip(line.points[time], picture.width):
+                axes.fill(*corners.T, color=color, linewidth=0.6, zorder=2)
+            continue
         points = stroke(line, time, picture.width)[:, : 2 if picture.planar else 3]
-        axes.plot(*points.T, color=faded(DARK, fade), linewidth=2.0 if line.kind == "belt" else 1.0, zorder=2)
+        axes.plot(*points.T, color=color, linewidth=2.0 if line.kind in ("belt", "bar") else 1.0, zorder=2)
 
 
 def _draw_ground(axes, ground):

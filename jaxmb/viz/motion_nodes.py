@@ -12,12 +12,12 @@ from ..parts.base import GROUND
 from ..parts.names import unknown
 from ..parts.shapes import DARK, AbstractShape, Color, along
 from ..system import AbstractSystem
-from ..system.picture import Picture
+from ..system.picture import Picture, in_space
 from ..trajectory import Trajectory, at_rows, picture_of
 from . import stage
 from .meshes import Triangles, unit_mesh
 from .one_motion import check_finite, one_motion
-from .solids import COLORS, Placed, solids
+from .solids import COLORS, Placed, color_in, solids
 
 _SPRING: Color = (95, 100, 110)
 _REACTION: Color = (200, 30, 45)
@@ -77,7 +77,7 @@ class Motion:
         """
         quantities = self.trajectory.system.quantities()
         if f"{name}.position" in quantities:
-            return _in_space(self.trajectory.quantity(f"{name}.position"))
+            return in_space(self.trajectory.quantity(f"{name}.position"))
         parts = {key: anchors for key, anchors in self.picture.parts.items() if anchors.points[-1] is not None}
         if name in parts:
             return self._anchor(parts[name].bodies[-1], parts[name].points[-1])
@@ -86,7 +86,7 @@ class Motion:
 
     def reaction(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Points and forces [N] of a joint's reaction on the last of its moving bodies, shape (times, 1, 3)."""
-        force = _in_space(self.trajectory.reactions[name].force)
+        force = in_space(self.trajectory.reactions[name].force)
         part = self.picture.parts[name]
         last = max(k for k, body in enumerate(part.bodies) if body != GROUND)
         return self._anchor(part.bodies[last], part.points[last])[:, None], force[:, None]
@@ -96,7 +96,7 @@ class Motion:
         wrenches, part = np.asarray(self.trajectory.forces[name]), self.picture.parts[name]
         moving = [k for k, body in enumerate(part.bodies) if body != GROUND]
         points = [self._anchor(part.bodies[k], part.points[k]) for k in moving]
-        return np.stack(points, axis=1), _in_space(wrenches[:, moving, : 2 if self.picture.planar else 3])
+        return np.stack(points, axis=1), in_space(wrenches[:, moving, : 2 if self.picture.planar else 3])
 
     def _anchor(self, body, point):
         turn, place = self.picture.orientations[body], self.picture.positions[body]
@@ -152,20 +152,20 @@ class Motion:
 
     def _paths(self, prefix, offset, grain):
         out = []
-        for kind in ("rod", "coil"):
-            ends = [path.points for path in self.picture.paths.values() if path.kind == kind]
-            if not ends:
+        for kind, thickness in {"rod": 0.5, "coil": 1.8, "bar": 1.0}.items():
+            lines = {name: path.points for name, path in self.picture.paths.items() if path.kind == kind}
+            if not lines:
                 continue
-            ends = np.stack(ends, axis=1)
+            ends = np.concatenate([np.stack([x[:, :-1], x[:, 1:]], axis=2) for x in lines.values()], axis=1)
             line = ends[:, :, 1] - ends[:, :, 0]
             length = np.linalg.norm(line, axis=-1)
             along_z = np.array([0.0, 0.0, 1.0]) * (length == 0)[..., None] + line
             orientation = np.apply_along_axis(along, -1, along_z)
             start = ends[:, :, 0] if kind == "coil" else ends.mean(axis=2)
-            radius = (1.8 if kind == "coil" else 0.5) * self.picture.width
-            scales = np.stack([np.full_like(length, radius), np.full_like(length, radius), length], axis=-1)
-            scales = np.maximum(scales, grain)
-            colors = np.tile(_SPRING if kind == "coil" else DARK, (ends.shape[1], 1))
+            radius = np.full_like(length, thickness * self.picture.width)
+            scales = np.maximum(np.stack([radius, radius, length], axis=-1), grain)
+            of_lines = [_SPRING if kind == "coil" else color_in(self.picture, name, self.tint) for name in lines]
+            colors = np.repeat(of_lines, [x.shape[1] - 1 for x in lines.values()], axis=0)
             mesh = unit_mesh("coil" if kind == "coil" else "cylinder")
             args = start + offset, orientation, scales, colors
             out.append(stage.instances(f"{prefix}/solids/{kind}s", mesh, *args, grain))
@@ -181,9 +181,10 @@ def motion(
     trajectory: Trajectory,
     given: Mapping[str, AbstractShape | Sequence[AbstractShape]],
     tint: Color | None,
+    deformation: float = 1.0,
 ) -> Motion:
-    """A motion with its shapes; arguments as in `solids`."""
-    shown = picture_of(trajectory)
+    """A motion with its shapes; arguments as in `solids` and `picture_of`."""
+    shown = picture_of(trajectory, deformation)
     return Motion(name, trajectory, shown, solids(shown, given, tint), tint)
 
 
@@ -217,12 +218,6 @@ def chosen(trajectory: Trajectory, frames: int, least: int = 2) -> Trajectory:
     selection = at_rows(trajectory, rows)
     check_finite(selection)
     return selection
-
-
-def _in_space(values):
-    """Vectors of the plane or of space with three components."""
-    values = np.asarray(values)
-    return np.concatenate([values, np.zeros((*values.shape[:-1], 3 - values.shape[-1]))], axis=-1)
 
 
 def _reach(shape):

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from .._arguments import whole_number
-from ..parts.base import GROUND
 from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
 from .mechanism import drawn, faded, finish, in_world
 from .motion_nodes import chosen
 from .silhouettes import area, edges
-from .solids import COLORS, Placed, solids
+from .solids import COLORS, solids
 
 # A motion takes at least and at most so many seconds, if no speed is given. A frame takes a multiple of `_TICK` s.
 _SHORTEST, _LONGEST, _TICK = 2.0, 20.0, 0.01
@@ -25,7 +24,13 @@ _DPI, _PALETTE, _MARGIN, _FEW = 80, 64, 0.05, 8
 
 
 def save_movie(
-    trajectory: Trajectory, path: str | Path, *, frames: int = 100, speed: float | None = None, trails: bool = True
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    frames: int = 100,
+    speed: float | None = None,
+    trails: bool = True,
+    deformation: float = 1.0,
 ) -> Path:
     """Write a motion as an animated GIF, which pages, slides and chats show, or as a film in MP4.
 
@@ -42,7 +47,7 @@ def save_movie(
     - `path` of the file, `.gif` or `.mp4`.
     - `frames`: the largest number of saved times that are drawn.
     - `speed` of playing, 1 for real time; by default a motion plays in real time, but for 2 to 20 s.
-    - `trails`: whether the mass centres of up to 8 bodies leave a trail.
+    - `trails`: whether the mass centres of up to 8 bodies leave a trail; `deformation` as in `plot_mechanism`.
 
     **Returns:** the path.
 
@@ -61,10 +66,10 @@ def save_movie(
     if not trajectory.system.body_names:
         raise ValueError(f"A moving picture shows bodies, and a {type(trajectory.system).__name__} has none.")
     motion = chosen(trajectory, frames)
-    picture, times = picture_of(motion), np.asarray(motion.ts)
+    picture, times = picture_of(motion, deformation), np.asarray(motion.ts)
     lasts = float(times[-1] - times[0])
     lasts = float(np.clip(lasts, _SHORTEST, _LONGEST)) if speed is None else lasts / speed
-    _WRITERS[path.suffix](path, _drawn(picture, solids(picture, {}, None), times, trails), lasts / (times.size - 1))
+    _WRITERS[path.suffix](path, _drawn(picture, times, trails), lasts / (times.size - 1))
     return path
 
 
@@ -89,21 +94,23 @@ def _write_mp4(path, images, duration):
 _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
-def _drawn(picture: Picture, shapes: list[Placed], times: np.ndarray, trails: bool) -> Iterator[io.BytesIO]:
+def _drawn(picture: Picture, times: np.ndarray, trails: bool) -> Iterator[io.BytesIO]:
+    shapes = solids(picture, {}, None)
     low, high = _bounds(picture, shapes, times.size)
     dimension = 2 if picture.planar else 3
-    bodies = [name for name in picture.positions if name != GROUND]
     for k, t in enumerate(times):
         figure, axes = drawn(picture, shapes, [k])
-        if trails and len(bodies) <= _FEW:
-            for color, name in zip(COLORS, bodies, strict=False):
+        if trails and len(picture.bodies) <= _FEW:
+            for color, name in zip(COLORS, picture.bodies, strict=False):
                 trail = picture.positions[name][: k + 1, :dimension]
                 axes.plot(*trail.T, color=faded(color, 1.0), linewidth=0.8, alpha=0.6, zorder=1)
         limits = dict(zip(("xlim", "ylim", "zlim")[:dimension], zip(low, high, strict=True), strict=False))
         axes.set(**limits)
         finish(figure, axes, picture, shapes)
         axes.set(**limits)
-        axes.set_title(f"t = {t - times[0]:.2f} s", fontsize="medium", family="monospace")
+        axes.set_title(
+            "  ·  ".join([f"t = {t - times[0]:.2f} s", *picture.notes]), fontsize="medium", family="monospace"
+        )
         file = io.BytesIO()
         figure.savefig(file, dpi=_DPI)
         file.seek(0)

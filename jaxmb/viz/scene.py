@@ -6,7 +6,6 @@ import numpy as np
 
 from .._types import State
 from ..bodies.scene import Scene, as_given
-from ..parts.base import GROUND
 from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
 from ..trajectory import picture_of, still
@@ -60,7 +59,7 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     shapes = solids(picture, {}, None)
     figure, axes = drawn(picture, shapes, [0])
     dimension = 2 if picture.planar else 3
-    bodies = [name for name in picture.positions if name != GROUND]
+    bodies = picture.bodies
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
     for k, name in enumerate(bodies):
         color, place = color_of(k), picture.positions[name][0, :dimension]

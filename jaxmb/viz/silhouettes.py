@@ -39,12 +39,20 @@ def _placed(shape, points):
     return shape.position + (points * shape.scale) @ rotation_matrix(shape.orientation).T
 
 
+def strip(points: Float[np.ndarray, "points 3"], width: float) -> Float[np.ndarray, "segments 4 2"]:
+    """The corners [m] of the segments of a thick line in the plane."""
+    start, end = points[:-1, :2], points[1:, :2]
+    along = end - start
+    across = width * np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    return np.stack([start + across, end + across, end - across, start - across], axis=1)
+
+
 def stroke(line: Line, time: int, width: float) -> Float[np.ndarray, "points 3"]:
     """The points [m] of the line of a part at a time: a zigzag for a spring, a closed line for a belt."""
     points = line.points[time]
     if line.kind == "belt":
         return np.concatenate([points, points[:1]])
-    if line.kind == "rod":
+    if line.kind != "coil":
         return points
     start, along = points[0], points[-1] - points[0]
     across = np.array([-along[1], along[0], 0.0]) if np.any(along[:2]) else np.array([1.0, 0.0, 0.0])

@@ -34,12 +34,12 @@ def solids(
     **Arguments:** `given`: the shapes of bodies by name, in place of the default; `tint`: a colour for all bodies,
     default a colour each.
     """
-    points, width = _attachments(picture), picture.width
+    points, width, on_bars = _attachments(picture), picture.width, picture.on_bars
     of_parts: dict[str, list[AbstractShape]] = {name: [] for name in picture.positions}
     for body, shape in picture.shapes:
         of_parts[body].append(shape)
     out: list[Placed] = []
-    for k, name in enumerate(picture.positions):
+    for name in picture.positions:
         if name in given:
             body_shapes = given[name]
             body_shapes = [body_shapes] if isinstance(body_shapes, AbstractShape) else list(body_shapes)
@@ -51,12 +51,20 @@ def solids(
         elif name == GROUND:
             body_shapes = [_support(point, picture.up, width) for point in points[name]]
         else:
-            body_shapes = _linkage(points[name], picture.planar, width)
-            if not body_shapes and not of_parts[name]:
+            body_shapes = [] if name in picture.owners else _linkage(points[name], picture.planar, width)
+            if not body_shapes and name in on_bars:
+                body_shapes = [Sphere(width, color=None if name in picture.paths else DARK)]
+            elif not body_shapes and not of_parts[name] and name in picture.bodies:
                 body_shapes = _equivalent(*picture.inertias[name], width)
-        color = _GROUND if name == GROUND else tint or COLORS[k % len(COLORS)]
+        color = _GROUND if name == GROUND else color_in(picture, name, tint)
         out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
     return out
+
+
+def color_in(picture: Picture, name: str, tint: Color | None = None) -> Color:
+    """The colour of a body, of a frame in it, and of its line; other lines are dark."""
+    body = picture.owners.get(name, name)
+    return tint or COLORS[picture.bodies.index(body) % len(COLORS)] if body in picture.bodies else DARK
 
 
 def _attachments(picture):

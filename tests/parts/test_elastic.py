@@ -426,15 +426,16 @@ def loaded_bar():
     return mb.Scene([rod], joints=[clamp], forces=forces, frames=frames).compile()
 
 
-def check_derivatives(output, rtol):
+def check_derivatives(output, rtol, given=DESIGN, batched=True):
     """Forward mode, reverse mode and central differences, by relative changes of the design."""
-    names, values = zip(*DESIGN.items(), strict=True)
+    names, values = zip(*given.items(), strict=True)
     of = jax.jit(lambda x: output({name: x[k] * values[k] for k, name in enumerate(names)}))
     one = np.ones(len(names))
     reverse, forward = jax.jit(jax.grad(of))(one), jax.jit(jax.jacfwd(of))(one)
     np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-12)
     steps = 1e-4 * np.eye(len(names))
-    ends = np.asarray(jax.vmap(of)(np.concatenate([one + steps, one - steps])))
+    changed = np.concatenate([one + steps, one - steps])
+    ends = np.asarray(jax.vmap(of)(changed) if batched else [of(x) for x in changed])
     differences = (ends[: len(names)] - ends[len(names) :]) / 2e-4
     np.testing.assert_allclose(reverse, differences, rtol=rtol, atol=rtol * np.max(np.abs(differences)))
     assert np.all(np.abs(differences[:3]) > 1e-6)
@@ -460,6 +461,61 @@ def test_derivatives_of_a_motion():
         return mb.simulate(changed, mb.assemble(changed), t1=0.05, rtol=1e-11).quantity("tip.position")[-1, 1]
 
     check_derivatives(place, 1e-4)
+
+
+PROPPED = {name: value for name, value in DESIGN.items() if name.startswith("rod.")}
+PROPPED |= {"prop.station": 0.7, "pull.force": np.array([-20.0, -15.0])}
+
+
+def propped_bar():
+    """Clamped, on a prop, with a load on its end that presses and bends it."""
+    section: dict[str, Any] = {name.removeprefix("rod."): x for name, x in PROPPED.items() if name.startswith("rod.")}
+    rod = planar.ElasticBar("rod", width=0.03, bending=3, **section)
+    at = {"point_a": (0.0, 0.0), "point_b": (0.0, 0.0)}
+    joints = [
+        planar.Fixed("clamp", "ground", "rod", **at),
+        planar.PointOnLine("slide", "ground", "prop", axis_a=(1.0, 0.0), **at),
+    ]
+    frames = [planar.BarFrame("prop", "rod", station=PROPPED["prop.station"]), planar.BarFrame("tip", "rod")]
+    forces = [planar.PointForce("pull", "tip", force=PROPPED["pull.force"]), mb.Gravity((0.0, -9.81))]
+    return mb.Scene([rod], joints=joints, forces=forces, frames=frames).compile()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["deflection", "frequency"])
+def test_derivatives_by_the_place_of_a_joint_and_by_a_load(of):
+    """And by the numbers of the bar, of a deflection and of the lowest frequency about the loaded bar."""
+    system = propped_bar()
+
+    def output(design):
+        changed = mb.with_parameters(system, design)
+        rest = mb.equilibrium(changed)
+        if of == "frequency":
+            return mb.linearise(changed, rest).frequencies[0]
+        return mb.evaluate(changed, rest, ["tip.deflection"])["tip.deflection"][1]
+
+    check_derivatives(output, 1e-6, PROPPED, batched=False)
+
+
+@pytest.mark.slow
+def test_derivatives_through_an_impact_of_a_bar():
+    """A bar springs back, and its end strikes a stop once."""
+    given = {name: value for name, value in DESIGN.items() if name.startswith("rod.")}
+    section: dict[str, Any] = {name.removeprefix("rod."): value for name, value in given.items()}
+    rod = planar.ElasticBar("rod", width=0.03, damping=1e-3, **section)
+    joints = [
+        planar.Fixed("clamp", "ground", "rod", point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+        mb.RigidContact("stop", "tip", terrain=mb.terrain.Flat(-0.02), radius=0.01, restitution=0.5),
+    ]
+    system = mb.Scene([rod], joints=joints, frames=[planar.BarFrame("tip", "rod")]).compile()
+
+    def run(design):
+        changed = mb.with_parameters(system, design)
+        start = mb.assemble(changed, fix={"rod.bend_1": 0.05, "rod.bend_2": 0.0})
+        return mb.simulate(changed, start, t1=0.066, rtol=1e-10, atol=1e-12)
+
+    assert len(run(given).events) == 1
+    check_derivatives(lambda design: run(design).quantity("tip.position")[-1, 1], 1e-4, given, batched=False)
 
 
 def bar(**changed):
