@@ -277,7 +277,8 @@ def _prices(solution: Solution) -> dict[str, np.ndarray]:
 def _active(solution: Solution) -> tuple[str, ...]:
     transcription, z = solution.transcription, solution.answer.z
     problem, task, places = transcription.problem, transcription.task, transcription.places
-    at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale
+    free = problem.low < problem.high
+    at_bound = free & (np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale)
     out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
     begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
     out += [
