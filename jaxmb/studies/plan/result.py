@@ -124,16 +124,12 @@ class Plan(Printed):
     @functools.cached_property
     def arrival(self) -> float:
         """The distance of the end of `trajectory` from the plan's end, relative to the largest coordinates and
-        velocities.
+        velocities, or to such coordinates in the duration.
         """
         end, there = (jax.tree.map(lambda y: np.asarray(y[-1]), ys) for ys in (self.trajectory.ys, self.states))
-        scale = [max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u)]
-        return float(
-            max(
-                np.max(np.abs(a - b), initial=0.0) / s
-                for a, b, s in zip((end.q, end.u), (there.q, there.u), scale, strict=True)
-            )
-        )
+        q, u = (max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u))
+        each = (end.q, there.q, q), (end.u, there.u, max(u, q / self.duration))
+        return float(max(np.max(np.abs(a - b), initial=0.0) / scale for a, b, scale in each))
 
     @functools.cached_property
     def violation(self) -> dict[str, float]:

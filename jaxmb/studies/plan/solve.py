@@ -21,6 +21,8 @@ _LEAST_ERROR = 1e-10
 _FIRST_ERROR = 1e-3
 # The factor by which a round may have more steps than the last: far from a motion, errors are no measure.
 _FURTHER = 4
+# The effect of a control, relative to the largest of any, that is none.
+_NO_EFFECT = 1e-13
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
 _SMALL_JUMP, _SWITCH = 0.02, 0.4
 
@@ -194,9 +196,10 @@ def _control_scales(part: Transcription, at: Evaluated) -> list[np.ndarray]:
     jacobian = np.take_along_axis(at.jacobians[0], indices[:, :, None], 1) / nodes.scales[1:, :, None]
     effect = np.zeros(term.offset.size // task.intervals)
     effect[list(term.block.active)] = np.abs(jacobian).max(axis=(0, 1))
-    begin, out = nodes.coordinates.shape[1] + 2, []
+    # Below this only rounding errors are left: a force that a constraint bears has no effect.
+    begin, out, least = nodes.coordinates.shape[1] + 2, [], _NO_EFFECT * float(np.max(effect, initial=0.0))
     for control in task.controls:
         own = effect[begin : begin + control.size * control.course.local].reshape(control.course.local, -1)[0]
         begin += control.size * control.course.local
-        out.append(np.where(own > 0, 1.0 / (np.where(own > 0, own, 1.0) * task.intervals), 1.0))
+        out.append(np.where(own > least, 1.0 / (np.where(own > least, own, 1.0) * task.intervals), 1.0))
     return out

@@ -209,12 +209,14 @@ def test_plan_turns_a_free_body_by_an_arm_alone():
     motors = [mb.JointForce(name, f"shoulder.angle_{side}", force=0.0) for name, side in (("yaw", "a"), ("pitch", "b"))]
     system = mb.Scene([base, arm], joints=[shoulder], forces=motors).compile()
     swing = lambda t: 0.8 * np.sin(0.5 * np.pi * t)
+    # The first component of the vector part is given, and the others are free.
+    rolled = tuple(np.array([side, np.sin(0.1), side, side]) for side in (-np.inf, np.inf))
     plan = mb.plan(
         system,
         controls={"yaw.force": None, "pitch.force": None},
         duration=4.0,
         start=mb.assemble(system),
-        end=at_rest(shoulder__angle_a=0.0, shoulder__angle_b=0.0) | {"base.q1": np.sin(0.1)},
+        end=at_rest(shoulder__angle_a=0.0, shoulder__angle_b=0.0) | {"base.orientation": rolled},
         running="effort",
         intervals=24,
         guess={"shoulder.angle_a": swing, "shoulder.angle_b": lambda t: swing(t) * np.sin(0.25 * np.pi * t)},
