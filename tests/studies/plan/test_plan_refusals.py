@@ -55,6 +55,25 @@ def test_two_numbers_bound_a_vector_along_the_way_and_are_its_value_at_an_end(sy
     np.testing.assert_array_equal([low, high], [[-1.0, -2.0], [1.0, 2.0]])
 
 
+def test_prices_of_a_fixed_state_are_those_of_its_coordinates(system):
+    ends = [{"pin.angle": angle, "pin.angle_rate": 0.0} for angle in (0.0, 1.0)]
+    options = {"controls": {"motor.force": None}, "duration": 1.0, "running": "effort", "intervals": 4}
+    named = mb.plan(system, start=ends[0], end=ends[1], **options)
+    start, end = (mb.assemble(system, fix={"pin.angle": given["pin.angle"]}) for given in ends)
+    fixed = mb.plan(system, start=start, end=end, **options)
+    for where, angle in (("start", 0.0), ("end", 1.0)):
+        prices = {name: value for name, value in fixed.prices.items() if name.startswith(where)}
+        assert len(prices) == 2
+        # One coordinate is that of the bar's pose, whose slope by the angle the chain rule tells.
+        slopes = {"bar.x": -0.5 * np.sin(angle), "bar.y": 0.5 * np.cos(angle), "bar.angle": 1.0}
+        for name, price in prices.items():
+            rate = name.endswith("_rate")
+            slope = slopes[name.removeprefix(f"{where} ").removesuffix("_rate")]
+            np.testing.assert_allclose(
+                price * slope, named.prices[f"{where} pin.angle{'_rate' if rate else ''}"], rtol=1e-6
+            )
+
+
 def test_guess_chooses_what_the_start_leaves_free(system):
     """The start gives a height that two angles have; the guess is near the second."""
     height = 0.5 * np.sin(0.3)
