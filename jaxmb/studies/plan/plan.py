@@ -162,7 +162,7 @@ def _told(system: AbstractSystem, where: str, function: Any, others: Any) -> Any
     state = State(jnp.zeros(system.nq), jnp.zeros(system.nu), jnp.zeros(system.nz) if system.nz else None)
 
     def number(at):
-        value = function(at)
+        value: Any = function(at)
         if value is None or jnp.shape(value):
             got = "nothing" if value is None else f"shape {jnp.shape(value)}"
             raise ValueError(f"plan: {where}= must return a number, and returns {got}.")

@@ -3,10 +3,11 @@
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..._types import State
 from .guess import Guess
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
@@ -90,7 +91,8 @@ def solved(
         answer = minimise(problem, program.start, answer, chosen, left, tol, watched)
         problem.at(answer.z)
         worn, before = program.quality(), steps
-        found = [part.read(z) for part, z in zip(program.parts, program.variables(answer.z), strict=True)]
+        each = zip(program.parts, program.variables(answer.z), program.intervals(), strict=True)
+        found = [_reached(part.read(z), at) for part, z, at in each]
         steps, errors = _enough_steps(program, answer.z, steps, tol, [_FURTHER * count for count in steps])
         lost = not all(np.all(np.isfinite(x)) for guess in found for x in (guess.states.q, guess.states.u))
         guesses = guesses if lost else found
@@ -98,6 +100,20 @@ def solved(
         if is_last or (steps == before and worn <= _WORN):
             return _each_phase(program, answer, guesses, tuple(log), errors)
     raise AssertionError("unreachable")
+
+
+def _reached(found: Guess, at: Evaluated) -> Guess:
+    """The states at nodes; the last, which may have left its chart since no interval begins there, is then the arrival
+    of the last interval.
+    """
+    states, arrived = found.states, at.outputs[0][-1]
+    if np.all(np.isfinite(states.q[-1])) and np.all(np.isfinite(states.u[-1])):
+        return found
+    nq, nu = states.q.shape[1], states.u.shape[1]
+    q, u, z, _ = np.split(arrived, [nq, nq + nu, arrived.size - 2])
+    pairs = (states.q, q), (states.u, u), *(() if states.z is None else ((states.z, z),))
+    replaced: list[Any] = [np.concatenate([ys[:-1], y[None]]) for ys, y in pairs]
+    return found._replace(states=State(*replaced))
 
 
 def _each_phase(program, answer, guesses, log, errors):

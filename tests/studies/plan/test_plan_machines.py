@@ -1,5 +1,7 @@
 """Optimal control of machines against exact optima, Pontryagin's equations, and simulations by another method."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -47,7 +49,7 @@ def five_bar():
     tip = (B + C) / 2 + np.sqrt(0.9**2 - distance**2 / 4) * np.array([-along[1], along[0]])
 
     def bar(name, mass, start, end):
-        length, angle = np.linalg.norm(end - start), np.arctan2(*(end - start)[::-1])
+        length, angle = float(np.linalg.norm(end - start)), np.arctan2(*(end - start)[::-1])
         return planar.Body(name, mass=mass, inertia=planar.rod(mass, length), position=(start + end) / 2, angle=angle)
 
     bodies = [bar("left", 1.0, A, B), bar("left_arm", 0.8, B, tip), bar("right", 1.0, D, C)]
@@ -112,7 +114,7 @@ def stewart():
     turn = lambda aside: np.deg2rad([[120.0 * k - aside, 120.0 * k + aside] for k in range(3)]).reshape(-1)
     ring = lambda radius, angles, z: np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(6, z)], axis=1)
     bodies, joints = [spatial.Body("top", mass=10.0, inertia=(0.6, 0.6, 1.2), position=(0.0, 0.0, 1.0))], []
-    forces = [mb.Gravity((0.0, 0.0, -9.81))]
+    forces: list[Any] = [mb.Gravity((0.0, 0.0, -9.81))]
     for k, (foot, ball) in enumerate(zip(ring(1.0, turn(50.0), 0.0), ring(0.5, turn(10.0), 1.0), strict=True)):
         along = (ball - foot) / np.linalg.norm(ball - foot)
         across = np.cross(along, (0.0, 0.0, 1.0))
