@@ -44,6 +44,8 @@ def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
     """
     named: dict[str, Any] = dict(given) if isinstance(given, Mapping) else {}
     motion = None if isinstance(given, Mapping) else given
+    if motion is not None and getattr(motion, "ts", None) is None:
+        raise ValueError(f"plan: guess must be values by name, a Trajectory or a Plan; got {motion!r}.")
     low, high = task.duration
     usual = float(motion.ts[-1] - motion.ts[0]) if motion is not None else np.sqrt(low * high)
     duration = float(np.clip(named.pop("duration", usual), low, high))
@@ -96,11 +98,14 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
     for name in named:
         if name not in known:
             raise unknown("coordinate", name, known, "plan: guess")
-    start = _first(system, task.start, ts[0]) or begin
+    at = lambda t: {name: value(t) if callable(value) else value for name, value in named.items()}
+    near = _assembled(system, None, at(ts[0]), ts[0], "the guess") if named else None
+    start = _first(system, task.start, ts[0], near) or begin
     state = start or (task.end if isinstance(task.end, State) else assemble(system, t=ts[0]))
     shares = task.shares[np.unique(np.linspace(0, task.intervals, min(task.intervals, _KNOTS) + 1).round().astype(int))]
     times = ts[0] + (ts[-1] - ts[0]) * shares
-    fixed = {name: [value(t) if callable(value) else value for t in times] for name, value in named.items()}
+    guessed = [at(t) for t in times]
+    fixed = {name: [values[name] for values in guessed] for name in named}
     if not named and not isinstance(task.end, State) and (there := _given(system, task.end, known, state, ts[0])):
         here = evaluate(system, state, list(there), t=ts[0])
         fixed = {
@@ -156,16 +161,16 @@ def carried(before: AbstractSystem, state: State, system: AbstractSystem, t: Sca
     return _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
 
 
-def _first(system: AbstractSystem, given: State | Limits, t: Scalar) -> State | None:
-    """A state with the coordinates and rates that are given at the start, None if none is."""
+def _first(system: AbstractSystem, given: State | Limits, t: Scalar, near: State | None) -> State | None:
+    """The state next to a guess with the coordinates and rates that are given at the start, None if none is."""
     if isinstance(given, State):
         return given
     if not given.names:
         return None
-    state, joints = assemble(system, t=t), system.joint_coordinates()
+    state, joints = near or assemble(system, t=t), system.joint_coordinates()
     coordinates = _given(system, given, (*system.coordinate_names(), *joints), state, t)
     rates = _given(system, given, (*system.rate_names(), *(f"{name}_rate" for name in joints)), state, t)
-    return _assembled(system, None, coordinates, t, "the start", rates=rates or None)
+    return _assembled(system, near, coordinates, t, "the start", rates=rates or None)
 
 
 def _given(

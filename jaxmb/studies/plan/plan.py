@@ -75,6 +75,7 @@ def plan(
     - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
     - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
         high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. Others are free.
+        For vectors of two components `(x, y)` is the value, and `((x, y), (x, y))` are bounds.
     - `running`: a function of the instant by names, `lambda at: at["motor.force"] ** 2`; or `"effort"`, the sum of the
         squares of the controls.
     - `final`: a function of the end, `lambda at: -at["tip.position"][0]`; or `"time"`, the duration.
@@ -119,6 +120,10 @@ def plan(
         t0=t0,
     )
     check_minimised([(running, final)])
+    if moving and interpolation != "held":
+        raise ValueError(
+            f"plan: moving nodes need controls that jump: take interpolation='held', got {interpolation!r}."
+        )
     options = method_options(method, max_iterations, tol, verbose)
     (solution,) = solved([task], [first_guess(task, guess)], *options)
     if moving and solution.answer.success:
@@ -131,7 +136,7 @@ def plan(
 def method_options(method: Any, max_iterations: Any, tol: Any, verbose: bool) -> tuple[Any, int, float, Any]:
     """The checked options of `solved`."""
     whole_number("plan: max_iterations", max_iterations)
-    if not tol > 0:
+    if not real_array("plan: tol", tol, float) > 0:
         raise ValueError(f"plan: tol must be positive, got {tol!r}.")
     return method, max_iterations, tol, _print if verbose else lambda iteration: None
 
@@ -146,15 +151,26 @@ def check_minimised(objectives: Sequence[tuple[Any, Any]]) -> None:
                 raise ValueError(f"plan: give {_OBJECTIVES}; got {given!r}.")
 
 
-def _told(system: AbstractSystem, function: Any, others: Any) -> Any:
-    """A user's function of the instant, compared by its program; words as they are."""
+def _told(system: AbstractSystem, where: str, function: Any, others: Any) -> Any:
+    """A user's function of the instant, compared by its program; words as they are.
+
+    **Raises:** `ValueError` for a value that is no number.
+    """
     if not callable(function):
         return function
     numbers, rest = eqx.partition(system, eqx.is_array)
     state = State(jnp.zeros(system.nq), jnp.zeros(system.nu), jnp.zeros(system.nz) if system.nz else None)
+
+    def number(at):
+        value: Any = function(at)
+        if value is None or jnp.shape(value):
+            got = "nothing" if value is None else f"shape {jnp.shape(value)}"
+            raise ValueError(f"plan: {where}= must return a number, and returns {got}.")
+        return value
+
     seen = lambda numbers, state, t, given: Reading(eqx.combine(numbers, rest), state, t, given)
     with traced_by_jax("the objective of plan", "the instant"):
-        return told_apart(function, seen, numbers, state, jnp.zeros(()), others)
+        return told_apart(number, seen, numbers, state, jnp.zeros(()), others)
 
 
 def _print(iteration: Iteration) -> None:
@@ -186,7 +202,8 @@ def task_of(
         checked_state(system, given) if isinstance(given, State) else checked_limits(system, where, given, others)
         for where, given in zip(("start", "end"), ends, strict=True)
     )
-    running, final = (_told(system, given, others) for given in objective)
+    each = zip(("running", "final"), objective, strict=True)
+    running, final = (_told(system, where, given, others) for where, given in each)
     shares = checked_shares(intervals)
     return Task(
         system=system,

@@ -130,16 +130,12 @@ class Plan(Printed):
     @functools.cached_property
     def arrival(self) -> float:
         """The distance of the end of `trajectory` from the plan's end, relative to the largest coordinates and
-        velocities.
+        velocities, or to such coordinates in the duration.
         """
         end, there = (jax.tree.map(lambda y: np.asarray(y[-1]), ys) for ys in (self.trajectory.ys, self.states))
-        scale = [max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u)]
-        return float(
-            max(
-                np.max(np.abs(a - b), initial=0.0) / s
-                for a, b, s in zip((end.q, end.u), (there.q, there.u), scale, strict=True)
-            )
-        )
+        q, u = (max(float(np.max(np.abs(x), initial=0.0)), 1e-300) for x in (self.states.q, self.states.u))
+        each = (end.q, there.q, q), (end.u, there.u, max(u, q / self.duration))
+        return float(max(np.max(np.abs(a - b), initial=0.0) / scale for a, b, scale in each))
 
     @functools.cached_property
     def violation(self) -> dict[str, float]:
@@ -301,7 +297,8 @@ def _prices(solution: Solution) -> dict[str, np.ndarray]:
 def _active(solution: Solution) -> tuple[str, ...]:
     transcription, z = solution.transcription, solution.answer.z
     problem, task, places = transcription.problem, transcription.task, transcription.places
-    at_bound = np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale
+    free = problem.low < problem.high
+    at_bound = free & (np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale)
     out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
     begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
     out += [

@@ -3,10 +3,11 @@
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..._types import State
 from .guess import Guess
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
@@ -21,6 +22,8 @@ _LEAST_ERROR = 1e-10
 _FIRST_ERROR = 1e-3
 # The factor by which a round may have more steps than the last: far from a motion, errors are no measure.
 _FURTHER = 4
+# The effect of a control, relative to the largest of any, that is none.
+_NO_EFFECT = 1e-13
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
 _SMALL_JUMP, _SWITCH = 0.02, 0.4
 
@@ -88,7 +91,8 @@ def solved(
         answer = minimise(problem, program.start, answer, chosen, left, tol, watched)
         problem.at(answer.z)
         worn, before = program.quality(), steps
-        found = [part.read(z) for part, z in zip(program.parts, program.variables(answer.z), strict=True)]
+        each = zip(program.parts, program.variables(answer.z), program.intervals(), strict=True)
+        found = [_reached(part.read(z), at) for part, z, at in each]
         steps, errors = _enough_steps(program, answer.z, steps, tol, [_FURTHER * count for count in steps])
         lost = not all(np.all(np.isfinite(x)) for guess in found for x in (guess.states.q, guess.states.u))
         guesses = guesses if lost else found
@@ -96,6 +100,20 @@ def solved(
         if is_last or (steps == before and worn <= _WORN):
             return _each_phase(program, answer, guesses, tuple(log), errors)
     raise AssertionError("unreachable")
+
+
+def _reached(found: Guess, at: Evaluated) -> Guess:
+    """The states at nodes; the last, which may have left its chart since no interval begins there, is then the arrival
+    of the last interval.
+    """
+    states, arrived = found.states, at.outputs[0][-1]
+    if np.all(np.isfinite(states.q[-1])) and np.all(np.isfinite(states.u[-1])):
+        return found
+    nq, nu = states.q.shape[1], states.u.shape[1]
+    q, u, z, _ = np.split(arrived, [nq, nq + nu, arrived.size - 2])
+    pairs = (states.q, q), (states.u, u), *(() if states.z is None else ((states.z, z),))
+    replaced: list[Any] = [np.concatenate([ys[:-1], y[None]]) for ys, y in pairs]
+    return found._replace(states=State(*replaced))
 
 
 def _each_phase(program, answer, guesses, log, errors):
@@ -194,9 +212,10 @@ def _control_scales(part: Transcription, at: Evaluated) -> list[np.ndarray]:
     jacobian = np.take_along_axis(at.jacobians[0], indices[:, :, None], 1) / nodes.scales[1:, :, None]
     effect = np.zeros(term.offset.size // task.intervals)
     effect[list(term.block.active)] = np.abs(jacobian).max(axis=(0, 1))
-    begin, out = nodes.coordinates.shape[1] + 2, []
+    # Below this only rounding errors are left: a force that a constraint bears has no effect.
+    begin, out, least = nodes.coordinates.shape[1] + 2, [], _NO_EFFECT * float(np.max(effect, initial=0.0))
     for control in task.controls:
         own = effect[begin : begin + control.size * control.course.local].reshape(control.course.local, -1)[0]
         begin += control.size * control.course.local
-        out.append(np.where(own > 0, 1.0 / (np.where(own > 0, own, 1.0) * task.intervals), 1.0))
+        out.append(np.where(own > least, 1.0 / (np.where(own > least, own, 1.0) * task.intervals), 1.0))
     return out

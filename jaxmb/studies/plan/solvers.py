@@ -139,9 +139,10 @@ def _ipopt(problem: Problem, z: np.ndarray, before: Answer | None, limit: int, t
     multipliers, below, above = np.zeros(count), np.zeros(scale.size), np.zeros(scale.size)
     w, _, status = program.solve(z / scale, mult_g=multipliers, mult_x_L=below, mult_x_U=above)
     message = "interrupted" if interrupted else _MESSAGES.get(status, f"IPOPT ended with status {status}")
-    return Answer(
-        w * scale, multipliers, (above - below) / scale, status in (_SOLVED, _ACCEPTABLE), message, interrupted, barrier
-    )
+    # IPOPT has no multipliers of variables that are fixed: they balance the slope of the Lagrangian.
+    slope: Any = problem.jacobian(problem.at(w * scale)).T @ np.append(1.0, multipliers)
+    of_bounds = np.where(problem.low == problem.high, -slope, (above - below) / scale)
+    return Answer(w * scale, multipliers, of_bounds, status in (_SOLVED, _ACCEPTABLE), message, interrupted, barrier)
 
 
 def _slsqp(problem: Problem, z: np.ndarray, limit: int, tol: float, told: Told) -> Answer:

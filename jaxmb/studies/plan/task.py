@@ -142,7 +142,10 @@ def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> 
                 "interpolation='cubic'."
             )
         pair = (None, None) if pair is None else pair
-        bounds.append(bounds_of(f"plan: the bounds of control {name!r}", pair, value.shape))
+        low, high = bounds_of(f"plan: the bounds of control {name!r}", pair, value.shape, equal=True)
+        if np.all(low == high):
+            raise ValueError(f"plan: the control {name!r} is held by its bounds {pair}; leave it out of controls.")
+        bounds.append((low, high))
         controls.append(Control(name, value.shape, course))
     return tuple(controls), tuple(bounds)
 
@@ -174,14 +177,11 @@ def checked_limits(system: AbstractSystem, where: str, given: Any, others: Mappi
     shapes, lows, highs = [], [], []
     for name, value in (given or {}).items():
         shape = _shape(system, name, others, where)
-        pair = value if isinstance(value, tuple) and len(value) == 2 and shape != (2,) else (value, value)
-        if (
-            isinstance(value, tuple)
-            and len(value) == 2
-            and shape == (2,)
-            and any(np.ndim(x) or x is None for x in value)
-        ):
-            pair = value
+        is_pair = isinstance(value, tuple) and len(value) == 2
+        if where != "path" and shape == (2,):
+            # Two numbers at an end are the value of a vector of two.
+            is_pair = is_pair and any(np.ndim(x) or x is None for x in value)
+        pair = value if is_pair else (value, value)
         low, high = bounds_of(f"plan: {where} of {name!r}", pair, shape, equal=True)
         shapes.append(shape)
         lows.append(low.reshape(-1))

@@ -319,7 +319,7 @@ class _Transcriber:
             count = control.course.count(task.intervals)
             values = where[: task.intervals + 1] if control.course.smooth else where
             low[values], high[values] = ends
-            bounded = np.isfinite(ends[0]) & np.isfinite(ends[1])
+            bounded = np.isfinite(ends[0]) & np.isfinite(ends[1]) & (ends[0] < ends[1])
             usual = np.ones(control.size) if control_scales is None else control_scales[number]
             scale[where] = np.where(
                 bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual
