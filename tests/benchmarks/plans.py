@@ -19,7 +19,7 @@ def by_jaxmb():
     import jaxmb as mb
     from jaxmb import planar
 
-    mb.setup(keep=None)
+    mb.setup(keep=False)
     cart = planar.Body("cart", mass=CART, inertia=1.0)
     pole = planar.Body("pole", mass=BOB, inertia=1e-12, position=(0.0, -LENGTH))
     slide = planar.Prismatic("slide", "ground", "cart", point=(0.0, 0.0), axis=(1.0, 0.0))
@@ -63,7 +63,6 @@ def by_dymos(segments, order):
                 self.add_output(name, np.zeros(n), units=unit)
             rows = np.arange(n)
             self.declare_partials("*", "*", rows=rows, cols=rows, method="cs")
-            self.declare_coloring(wrt="*", method="cs", show_summary=False)
 
         def compute(self, inputs, outputs):
             angle, rate, force = (inputs[name] for name in ("angle", "rate", "force"))
@@ -77,7 +76,6 @@ def by_dymos(segments, order):
     begin = time.perf_counter()
     problem = om.Problem(reports=False)
     problem.driver = om.ScipyOptimizeDriver(optimizer="SLSQP", tol=1e-9, maxiter=500, disp=False)
-    problem.driver.declare_coloring(show_summary=False, show_sparsity=False)
     phase = dm.Phase(ode_class=CartPole, transcription=dm.Radau(num_segments=segments, order=order, compressed=True))
     motion = dm.Trajectory()
     motion.add_phase("phase", phase)
@@ -105,7 +103,7 @@ def main():
     try:
         import dymos  # noqa: F401
 
-        for segments, order in ((20, 3), (30, 5)):
+        for segments, order in ((10, 3), (20, 3)):
             runs.append((f"dymos, {segments} segments of order {order}", lambda a=segments, b=order: by_dymos(a, b)))
     except ImportError:
         print("dymos is not installed: pip install dymos")
