@@ -19,10 +19,11 @@ from ...simulate.simulate import simulate
 from ...system import AbstractSystem, with_inputs, with_parameters
 from ...trajectory import Trajectory
 from ..evaluate import Reading
+from .guess import Guess, first_guess
 from .lanes import Model
 from .sensitivity import Sensitivity, derivatives, sensitivities
 from .solve import Iteration, Solution, solved
-from .task import Named
+from .task import Named, Task
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -185,7 +186,27 @@ class Plan(Printed):
 
         **Raises:** as `derivatives`.
         """
+        self._check_alone("sensitivities")
         return sensitivities(self.solution, names)
+
+    def refined(self) -> "Plan":
+        """The plan on twice the intervals, found from this plan: the change of the objective tells its error.
+
+        **Raises:** `ValueError` for a part of a `PhasedPlan`, whose ends belong to other phases.
+        """
+        self._check_alone("refined")
+        task, nodes = self.solution.transcription.task, np.arange(len(self.ts))
+        shares = np.interp(np.arange(2 * len(nodes) - 1) / 2, nodes, (self.ts - self.ts[0]) / self.duration)
+        finer = dataclasses.replace(task, shares=shares, arcs=tuple(2 * node for node in task.arcs))
+        return self._found_again(finer, first_guess(finer, self))
+
+    def _check_alone(self, what: str) -> None:
+        if not self.solution.alone:
+            raise ValueError(f"Plan.{what}: this is a phase of a plan; take the whole plan again by plan_phases.")
+
+    def _found_again(self, task: Task, guess: Guess) -> "Plan":
+        (again,) = solved([task], [guess], self.method, _LIMIT, self.tol, lambda _: None)
+        return judged(Plan.of(again, self.method, self.tol))
 
     def objective_of(self, values: Mapping[str, Any]) -> Any:
         """The optimal objective for other parameters of the system, found from this plan; differentiable by `jax.grad`.
@@ -198,6 +219,7 @@ class Plan(Printed):
 
         **Raises:** `RuntimeError` if the method does not converge.
         """
+        self._check_alone("objective_of")
         names = tuple(values)
 
         def optimum(values):
@@ -205,8 +227,7 @@ class Plan(Printed):
                 raise ValueError("Plan.objective_of runs outside of JAX: it cannot be used under jit or vmap.")
             solution, system = self.solution, with_parameters(self.solution.transcription.task.system, values)
             task = dataclasses.replace(solution.transcription.task, system=system)
-            (again,) = solved([task], [solution.found], self.method, _LIMIT, self.tol, lambda _: None)
-            other = Plan.of(again, self.method, self.tol)
+            other = self._found_again(task, solution.found)
             if not other.success:
                 raise RuntimeError(f"Plan.objective_of: the plan for {dict(values)!r} {other.message}.")
             return other

@@ -80,6 +80,15 @@ def test_plan_simulated_in_one_run_arrives_at_its_end_on_the_constraints(planned
     assert "motor.force" in str(plan) and "converged" in str(plan) and plan.active == ()
 
 
+def test_refined_plan_has_twice_the_intervals(planned):
+    finer = planned("effort", 8).refined()
+    assert finer.success and len(finer.ts) == 17
+    np.testing.assert_allclose(finer.objective, planned("effort", 16).objective, rtol=1e-9)
+    moved = planned("time", 6, "held").refined()
+    assert moved.success and len(moved.ts) == 13
+    np.testing.assert_allclose(moved.objective, LEAST_TIME, rtol=1e-6)
+
+
 def test_plan_of_least_time_switches_at_the_exact_time(planned):
     plan = planned("time", 6, "held")
     torque = np.asarray(plan.controls["motor.force"].values)[:-1]
