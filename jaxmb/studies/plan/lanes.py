@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from ..._types import State
 from ...linalg.jitted import jitted
 from ...manifold import Chart
+from ...manifold.impulse import after_impulse
 from ...system import AbstractSystem, with_inputs, with_parameters
 from ..evaluate import Reading
 from .courses import AbstractCourse, Piece
@@ -166,6 +167,23 @@ class Look(AbstractLane):
         state = Chart(system, *chart).state(t, x)
         numbers = self.function(Reading(system, state, t, model.given(t, controls, design)))
         return jnp.concatenate([jnp.ravel(jnp.asarray(number, x.dtype)) for number in jax.tree.leaves(numbers)])
+
+
+class Strike(AbstractLane):
+    """The state just after the constraints of the `next` system take hold at a node, by their ideal impulses.
+
+    The inputs are the coordinates in the chart. The outputs are all coordinates, velocities and internal states.
+    """
+
+    model: Model
+    next: AbstractSystem
+    t: Array
+
+    def __call__(self, chart, inputs, steps):
+        del steps
+        state = Chart(self.model.system, *chart).state(self.t, inputs)
+        after = after_impulse(self.next, jnp.zeros_like(self.t), state)
+        return jnp.concatenate(jax.tree.leaves(_plain(after)))
 
 
 @jitted

@@ -1,10 +1,12 @@
 """Optimal control in phases with different systems: a load is picked up, a joint locks."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
+import numpy as np
 from jaxtyping import ArrayLike
 
 from ..._arguments import check_kind
@@ -17,6 +19,9 @@ from .guess import carried, first_guess
 from .plan import check_minimised, method_options, task_of
 from .result import Plan, judged
 from .solve import Iteration, solved
+
+# The largest distance of states where phases meet, relative to the size of the system.
+_APART = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +96,10 @@ def plan_phases(
     best.objective, best.phases[0].controls["motor.force"]
     ```
 
-    Each phase begins where the last ended: independent coordinates and rates of the last system have the same values
-    in the next system, by their names. So the next system has bodies or joints of the same names, and no further
-    freedoms; velocities do not jump. The durations of phases may be free, and so their ends.
+    Each phase begins where the last ended: independent coordinates of the last system have the same values in the next
+    system, by their names. If both have the same bodies, constraints that take hold with the next phase exert their
+    ideal impulses, and velocities jump: a load is caught. Otherwise rates have the same values by their names. The next
+    system has no further freedoms. The durations of phases may be free, and so their ends.
 
     **Arguments:** `start` of the first phase and `end` of the last phase, and the others, as of `plan`.
 
@@ -129,11 +135,27 @@ def plan_phases(
     solutions = solved(tasks, guesses, *options)
     plans = tuple(judged(Plan.of(solution, method, tol)) for solution in solutions)
     failed = next((one for one in plans if not one.success), plans[0])
+    message = failed.message if not failed.success else _jumps(plans) or failed.message
     return PhasedPlan(
         phases=plans,
         objective=sum(one.objective for one in plans),
         duration=sum(one.duration for one in plans),
         iterations=solutions[0].iterations,
-        success=failed.success,
-        message=failed.message,
+        success=message == plans[0].message and failed.success,
+        message=message,
     )
+
+
+def _jumps(plans: Sequence[Plan]) -> str:
+    """What is wrong where phases meet: positions of bodies that would jump, "" if there are none."""
+    for k, (before, after) in enumerate(itertools.pairwise(plans), 1):
+        names = before.system.coordinate_names()
+        if names != after.system.coordinate_names():
+            continue
+        apart = np.abs(np.asarray(after.states.q[0]) - np.asarray(before.states.q[-1]))
+        worst = int(np.argmax(apart / np.asarray(before.system.coordinate_scale())))
+        if apart[worst] > _APART * np.asarray(before.system.coordinate_scale())[worst]:
+            name = next(name for name, places in names.items() if list(places) == [worst])
+            where = f"{name!r} jumps by {apart[worst]:.3g} between phases {k} and {k + 1}"
+            return f"{where}: give the place where they meet as the end= of the first"
+    return ""

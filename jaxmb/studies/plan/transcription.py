@@ -21,7 +21,7 @@ from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...system import AbstractSystem
 from .guess import Guess
-from .lanes import AbstractLane, Arrival, Block, Look, Model, in_lanes
+from .lanes import AbstractLane, Arrival, Block, Look, Model, Strike, in_lanes
 from .problem import Evaluated, Problem, Term
 from .task import Limits, Named, Task
 
@@ -224,29 +224,46 @@ def _joined(parts: Sequence[Transcription]) -> Problem:
         first = sparse.hstack([matrix[:1] for matrix in matrices])
         return sparse.csr_array(sparse.vstack([first, sparse.block_diag([matrix[1:] for matrix in matrices])]))
 
-    links = _Entries()
+    links, strikes, struck, terms = _Entries(), _Entries(), [], []
     for k in range(1, len(parts)):
-        before = parts[k - 1]
-        row = parts[k].rows_of["link"] + rows[k] - 1
-        links.add(row, before.places.x[-1] + begins[k - 1], -1.0 / before.nodes.scales[-1])
-    terms = []
+        before, after = parts[k - 1], parts[k]
+        row, last = after.rows_of["link"] + rows[k] - 1, before.places.x[-1] + begins[k - 1]
+        links.add(row, last[: row.size], -1.0 / before.nodes.scales[-1][: row.size])
+        if "strike" in after.rows_of:
+            indices, scales = after.nodes.charts[1][0], after.nodes.scales[0]
+            moving, row = np.flatnonzero(indices >= after.task.system.nq), after.rows_of["strike"] + rows[k] - 1
+            strikes.add(row, sum(term.outputs for term in struck) + indices[moving], 1.0 / scales[moving])
+            links.add(row, after.places.x[0][moving] + begins[k], -1.0 / scales[moving])
+            struck.append(_strike(before, after, last, shape[1]))
     for problem, begin in zip(problems, begins[:-1], strict=True):
         for term in problem.terms:
             entries = sparse.coo_array(term.inputs)
             inputs = (entries.data, (entries.row, entries.col + begin))
             wide = sparse.csr_array(inputs, shape=(term.offset.size, shape[1]))
             terms.append(Term(term.block, wide, term.offset, term.outputs))
+    of_outputs, count = whole([problem.of_outputs for problem in problems]), sum(term.outputs for term in struck)
     return Problem(
         scale=np.concatenate([problem.scale for problem in problems]),
         low=np.concatenate([problem.low for problem in problems]),
         high=np.concatenate([problem.high for problem in problems]),
-        terms=terms,
-        of_outputs=whole([problem.of_outputs for problem in problems]),
+        terms=[*terms, *struck],
+        of_outputs=sparse.csr_array(sparse.hstack([of_outputs, strikes.matrix((shape[0], count))])),
         of_variables=sparse.csr_array(whole([problem.of_variables for problem in problems]) + links.matrix(shape)),
         row_low=np.concatenate([problem.row_low for problem in problems]),
         row_high=np.concatenate([problem.row_high for problem in problems]),
         names=[name for problem in problems for name in problem.names],
     )
+
+
+def _strike(before: Transcription, after: Transcription, last: np.ndarray, variables: int) -> Term:
+    """The impulse between two phases, by the coordinates of the last node of the first, at the places `last`."""
+    task, charts = before.task, jax.tree.map(lambda x: x[-1:], before.nodes.charts)
+    model, ends = Model(task.system, (), ()), jnp.asarray(task.t0)
+    lane = Strike(model, after.task.system, ends)
+    inputs = sparse.csr_array((np.ones(last.size), (np.arange(last.size), last)), shape=(last.size, variables))
+    block = Block(lane, charts, tuple(range(last.size)))
+    state = charts[0]
+    return Term(block, inputs, np.zeros(last.size), state.q.size + state.u.size + task.system.nz)
 
 
 class _Transcriber:
@@ -281,11 +298,7 @@ class _Transcriber:
         if task.periodic:
             self._close()
         if before is not None:
-            # The coordinates of the phase before are subtracted where phases are joined.
-            scales, names = before.nodes.scales[-1], before.names_at(-1)
-            first = self._look(Named(names), [0], len(names))
-            rows = self._rows("link", [f"joint {name}" for name in names], np.zeros(len(names)), np.zeros(len(names)))
-            self.of_outputs.add(rows, first + np.arange(len(names)), 1.0 / scales)
+            self._follow(before)
         shape = 1 + sum(x.size for x in self.low), self.outputs
         problem = Problem(
             scale=scale,
@@ -424,6 +437,20 @@ class _Transcriber:
         sizes = np.tile(limits.sizes, len(at))
         rows = self._rows(where, names, np.tile(limits.low, len(at)) / sizes, np.tile(limits.high, len(at)) / sizes)
         self.of_outputs.add(rows, first + np.arange(len(at) * count), 1.0 / sizes)
+
+    def _follow(self, before: Transcription) -> None:
+        """Rows of the first node as the last node of the phase before, which are completed where phases are joined:
+        all coordinates by name, and if both phases have the same bodies, velocities after the impulse of constraints.
+        """
+        names, system = before.names_at(-1), self.task.system
+        if strikes := system.coordinate_names() == before.task.system.coordinate_names():
+            names = names[: np.count_nonzero(before.nodes.charts[1][-1] < system.nq)]
+        first, zeros = self._look(Named(names), [0], len(names)), np.zeros(len(names))
+        rows = self._rows("link", [f"joint {name}" for name in names], zeros, zeros)
+        self.of_outputs.add(rows, first + np.arange(len(names)), 1.0 / before.nodes.scales[-1][: len(names)])
+        if strikes:
+            zeros = np.zeros(np.count_nonzero(self.nodes.charts[1][0] >= system.nq))
+            self._rows("strike", ["joint velocity"] * zeros.size, zeros, zeros)
 
     def _close(self) -> None:
         """The last node is the first node, up to turns of angles."""

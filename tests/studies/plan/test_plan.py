@@ -199,6 +199,41 @@ def test_plan_by_cubic_controls_meets_the_exact_optimum_with_few_intervals(plann
 
 
 @pytest.mark.slow
+def test_phases_catch_a_load_by_its_impulse():
+    """A slider catches a resting one of its mass after half a metre, and both come to rest after another half metre.
+
+    Oracle: the least ∫ F² dt over d with velocities v and 0 at the ends is 4 m² (3 d² − 3 d v T + v² T²) / T³, and the
+    velocity halves where the sliders meet; the sum is minimised over v.
+    """
+    bodies = [
+        planar.Body(name, mass=1.0, inertia=1.0, position=(x, 0.0)) for name, x in (("slider", 0.0), ("load", 1.0))
+    ]
+    rail = planar.Prismatic("rail", "ground", "slider", point=(0.0, 0.0), axis=(1.0, 0.0))
+    forces = [mb.JointForce("push", "rail.displacement", force=0.0)]
+    resting = planar.Fixed("rest", "ground", "load", point=(1.0, 0.0))
+    caught = planar.Fixed("catch", "slider", "load", point_a=(0.5, 0.0), point_b=(0.0, 0.0))
+    alone, together = (mb.Scene(bodies, joints=[rail, joint], forces=forces).compile() for joint in (resting, caught))
+    phase = lambda system, **options: mb.Phase(
+        system, controls={"push.force": None}, duration=1.0, running="effort", intervals=4, **options
+    )
+    phases = [phase(alone, end={"slider.x": 0.5}), phase(together)]
+    start, end = ({"slider.x": x, "slider.x_rate": 0.0} for x in (0.0, 1.0))
+    plan = mb.plan_phases(phases, start=start, end=end)
+    effort = lambda mass, v: 4 * mass**2 * (3 * 0.5**2 - 3 * 0.5 * v + v**2)
+    speeds = np.linspace(0.0, 2.0, 200001)
+    total = effort(1.0, speeds) + effort(2.0, speeds / 2)
+    assert plan.success
+    np.testing.assert_allclose(plan.objective, total.min(), rtol=1e-8)
+    before, after = (np.asarray(one.states.u)[k] for one, k in zip(plan.phases, (-1, 0), strict=True))
+    np.testing.assert_allclose(
+        [before[0], after[0], after[3]], speeds[total.argmin()] * np.array([1, 0.5, 0.5]), atol=1e-4
+    )
+    # Without the meeting place as an end the load would jump.
+    apart = mb.plan_phases([phase(alone), phase(together)], start=start, end=end)
+    assert not apart.success and "'load.x' jumps by" in apart.message
+
+
+@pytest.mark.slow
 def test_plan_that_would_strike_a_stop_says_so():
     """A slider from rest to rest in two seconds, with a stop that it passes, or does not meet."""
 
