@@ -1,7 +1,6 @@
 """Optimal control of machines against exact optima, Pontryagin's equations, and simulations by another method."""
 
 import functools
-from typing import Any
 
 import jax
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from scipy import integrate
 
 import jaxmb as mb
-from jaxmb import mechanisms, planar, rotations, spatial
+from jaxmb import mechanisms, planar, spatial
 
 pytestmark = pytest.mark.slow
 
@@ -120,42 +119,6 @@ def test_plan_of_a_redundant_loop_in_space_is_the_plan_of_the_plane():
     )
     check_motion(plan)
     np.testing.assert_allclose(plan.objective, LEAST_EFFORT, rtol=1e-8)
-
-
-def stewart():
-    """A platform on six legs that turn at the ground and slide in balls of the platform."""
-    turn = lambda aside: np.deg2rad([[120.0 * k - aside, 120.0 * k + aside] for k in range(3)]).reshape(-1)
-    ring = lambda radius, angles, z: np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(6, z)], axis=1)
-    bodies, joints = [spatial.Body("top", mass=10.0, inertia=(0.6, 0.6, 1.2), position=(0.0, 0.0, 1.0))], []
-    forces: list[Any] = [mb.Gravity((0.0, 0.0, -9.81))]
-    for k, (foot, ball) in enumerate(zip(ring(1.0, turn(50.0), 0.0), ring(0.5, turn(10.0), 1.0), strict=True)):
-        along = (ball - foot) / np.linalg.norm(ball - foot)
-        across = np.cross(along, (0.0, 0.0, 1.0))
-        across /= np.linalg.norm(across)
-        axes = np.stack([along, across, np.cross(along, across)], axis=1)
-        leg = {"mass": 1.0, "inertia": spatial.box(1.0, 0.8, 0.1, 0.1), "position": foot + 0.4 * along}
-        bodies.append(spatial.Body(f"leg{k}", orientation=rotations.from_matrix(axes), **leg))
-        turns = {"axis_a_W": across, "axis_b_W": axes[:, 2]}
-        joints.append(spatial.Universal(f"foot{k}", "ground", f"leg{k}", point=foot, **turns))
-        joints.append(spatial.PointOnLine(f"ram{k}", f"leg{k}", "top", point=ball, axis=along))
-        forces.append(mb.JointForce(f"push{k}", f"ram{k}.displacement", force=0.0))
-    return mb.Scene(bodies, joints=joints, forces=forces).compile()
-
-
-def test_plan_moves_a_stewart_platform_with_six_legs():
-    system = stewart()
-    start = mb.assemble(system)
-    turned = np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)])
-    end = mb.assemble(system, start, fix={"top.position": (0.1, -0.05, 1.15), "top.orientation": turned})
-    controls = {f"push{k}.force": (-200.0, 200.0) for k in range(6)}
-    plan = mb.plan(system, controls=controls, duration=1.0, start=start, end=end, running="effort", intervals=16)
-    check_motion(plan)
-    assert plan.active == ()
-    np.testing.assert_allclose(plan.states.q[-1], end.q, rtol=0, atol=1e-8)
-    finer = mb.plan(
-        system, controls=controls, duration=1.0, start=start, end=end, running="effort", intervals=32, guess=plan
-    )
-    assert 0 <= plan.objective - finer.objective < 1e-4 * plan.objective
 
 
 def parked(intervals, **options):
