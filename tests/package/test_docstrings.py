@@ -222,7 +222,7 @@ LONG = (
     *("formulations.Partitioned", "lagrangian.QuasiVelocities", "formulations.accelerations", "system"),
     *("lagrangian.LagrangianSystem", "spatial.MagicFormulaTyre", "assembly_gap", "planar.Friction", "modules"),
     *("solvers.integrate", "JointCoupling", "smooth_step", "Trajectory.end", "evaluate", "viz.plot_sweep"),
-    *("Trajectory.plot", "Loads"),
+    *("PhasedPlan", "plan_phases", "Trajectory.plot", "Loads"),
 )
 
 

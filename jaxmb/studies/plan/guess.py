@@ -113,7 +113,7 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
             for name, value in there.items()
         }
     towards = task.end if isinstance(task.end, State) and not named else None
-    states = []
+    states, where = [], "the guess" if named else "the way to the end"
     for k, t in enumerate(times):
         if towards is not None:
             share = 1.0 / max(len(times) - k, 1)
@@ -121,7 +121,7 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
         fix = {name: values[k] for name, values in fixed.items()}
         state = State(state.q, jnp.zeros_like(state.u), state.z)
         if k or start is None:
-            state = _assembled(system, state, fix, t, f"the guess at t = {t:.4g} s")
+            state = _assembled(system, state, fix, t, f"{where} at t = {t:.4g} s")
         states.append(state if k or start is None else start)
     several = jax.tree.map(lambda *x: np.stack(x), *(State(s.q, s.u, s.z) for s in states))
     between = lambda y: np.stack([np.interp(ts, times, column) for column in y.T], axis=1)

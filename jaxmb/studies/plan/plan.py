@@ -13,6 +13,7 @@ from ..._traced_functions import traced_by_jax
 from ..._types import State
 from ...parts.names import names_arguments
 from ...simulate.arguments import checked_state
+from ...states.consistency import consistent
 from ...system import AbstractSystem
 from ...system.design import Bounds
 from ..evaluate import Reading
@@ -199,7 +200,9 @@ def task_of(
     others = {control.name: jnp.zeros(control.shape) for control in chosen}
     others |= {name: jnp.zeros(shape) for name, shape in shapes} | {"time": jnp.zeros(())}
     start, end = (
-        checked_state(system, given) if isinstance(given, State) else checked_limits(system, where, given, others)
+        consistent(system, t0, checked_state(system, given))
+        if isinstance(given, State)
+        else checked_limits(system, where, given, others)
         for where, given in zip(("start", "end"), ends, strict=True)
     )
     each = zip(("running", "final"), objective, strict=True)
