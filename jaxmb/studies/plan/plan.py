@@ -72,7 +72,7 @@ def plan(
     **Arguments:**
 
     - `controls`: bounds `(low, high)` of parameters that become functions of time, either of them None, or None
-        without bounds; parameters as of `with_inputs`.
+        without bounds; parameters as of `with_inputs`. `{}` with a `design` alone.
     - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
     - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
         high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. Others are free.
@@ -197,6 +197,8 @@ def task_of(
     intervals, interpolation = nodes
     chosen, control_bounds = checked_controls(system, controls, interpolation)
     shapes, design_bounds = checked_design(system, design, chosen)
+    if not (chosen or shapes):
+        raise ValueError("plan: there is nothing to choose; give controls={'motor.force': (-2.0, 2.0)} or design=.")
     others = {control.name: jnp.zeros(control.shape) for control in chosen}
     others |= {name: jnp.zeros(shape) for name, shape in shapes} | {"time": jnp.zeros(())}
     start, end = (

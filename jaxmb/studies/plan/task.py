@@ -124,7 +124,7 @@ def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> 
     """
     if interpolation not in COURSES:
         raise ValueError(f"plan: interpolation must be 'held', 'linear' or 'cubic', got {interpolation!r}.")
-    if not isinstance(given, Mapping) or not given:
+    if not isinstance(given, Mapping):
         raise ValueError(
             f"plan: controls must be bounds by the names of parameters, {{'motor.force': (-2.0, 2.0)}}; got {given!r}."
         )
@@ -158,7 +158,7 @@ def checked_design(system: AbstractSystem, given: Any, controls: tuple[Control, 
             raise unknown("parameter", name, existing, "plan: design")
         if name in (control.name for control in controls):
             raise ValueError(f"plan: {name!r} is a control and a designed parameter; take one of them.")
-        low, high = bounds_of(f"plan: the bounds of {name!r}", pair, existing[name].shape)
+        low, high = bounds_of(f"plan: the bounds of {name!r}", pair, existing[name].shape, equal=True)
         value = np.asarray(existing[name])
         if np.any(value < low) or np.any(value > high):
             raise ValueError(f"plan: {name!r} is {value} in the system, not within its bounds {pair}.")

@@ -199,6 +199,23 @@ def test_plan_by_cubic_controls_meets_the_exact_optimum_with_few_intervals(plann
 
 
 @pytest.mark.slow
+def test_parameters_alone_are_planned():
+    """The least stiffness by which a slider of 2 kg comes from rest to the middle in a second, (π / 2)² m."""
+    slider = planar.Body("slider", mass=2.0, inertia=1.0, position=(1.0, 0.0))
+    rail = planar.Prismatic("rail", "ground", "slider", point=(0.0, 0.0), axis=(1.0, 0.0))
+    spring = planar.Bushing(
+        "spring", "ground", "slider", point_a=(0.0, 0.0), point_b=(0.0, 0.0), stiffness=(4.0, 0.0, 0.0)
+    )
+    system = mb.Scene([slider], joints=[rail], forces=[spring]).compile()
+    name = next(name for name in mb.parameters(system) if "stiffness" in name)
+    bounds = ((0.5, 0.0, 0.0), (50.0, 0.0, 0.0))
+    ends = {"start": {"slider.x": 1.0, "slider.x_rate": 0.0}, "end": {"slider.x": 0.0}}
+    least = lambda at: at[name][0]
+    plan = mb.plan(system, controls={}, design={name: bounds}, duration=1.0, final=least, intervals=4, **ends)
+    assert plan.success and plan.objective == pytest.approx(2.0 * (np.pi / 2) ** 2, rel=1e-8)
+
+
+@pytest.mark.slow
 def test_phases_catch_a_load_by_its_impulse():
     """A slider catches a resting one of its mass after half a metre, and both come to rest after another half metre.
 
@@ -258,7 +275,8 @@ def test_plan_that_would_strike_a_stop_says_so():
 GOOD = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 4}
 REFUSED = [
     ({"controls": {"motor.forc": None}}, "Unknown control 'motor.forc'; did you mean 'motor.force'?"),
-    ({"controls": {}}, "controls must be bounds by the names of parameters"),
+    ({"controls": {}}, "there is nothing to choose"),
+    ({"controls": ["motor.force"]}, "controls must be bounds by the names of parameters"),
     ({"controls": {"motor.force": (2.0, -2.0)}}, "must be (low, high) with low"),
     ({"controls": {"crank.mass": None}}, "crank.mass"),
     ({"duration": 0.0}, "duration must be a positive number of seconds"),
