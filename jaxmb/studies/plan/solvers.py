@@ -16,14 +16,15 @@ _FAILED = 1e10
 _SOLVED, _ACCEPTABLE, _STOPPED = 0, 1, 5
 # IPOPT's first weight of the barrier.
 _BARRIER = 0.1
+_CURE = "another guess=, more intervals or wider bounds may help"
 _MESSAGES = {
     0: "converged",
     1: "converged to a lower accuracy",
-    2: "no point near the last satisfies the constraints",
-    3: "the step became too small",
+    2: f"no motion near the last meets all conditions; {_CURE}",
+    3: f"the step became too small; {_CURE}",
     5: "stopped to change charts",
     -1: "the limit of iterations was reached",
-    -2: "the search for points on the constraints failed",
+    -2: f"the search for a motion that meets all conditions failed; {_CURE}",
     -3: "no step could be computed",
     -10: "there are more conditions than variables",
 }
