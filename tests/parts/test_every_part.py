@@ -324,8 +324,8 @@ def test_a_part_that_stands_twice_is_named(name):
 @pytest.mark.filterwarnings("ignore:The velocities given with the bodies")
 @in_groups(CONSTRAINED)
 def test_parts_that_stand_twice_move_as_once(names):
-    """On their constraints."""
-    ends, examples = [], [EXAMPLES[name] for name in names]
+    """On their constraints; elastic parts would be twice as stiff."""
+    ends, examples = [], [EXAMPLES[name] for name in names if not name.endswith("InextensibleBeam")]
     for more in ((), [twin(example.part) for example in examples]):
         system = compiled(*examples, more=more)
         end = jax.tree.map(lambda x: x[-1], mb.simulate(system, mb.assemble(system), t1=T1, rtol=1e-10, **METHOD).ys)
