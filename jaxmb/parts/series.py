@@ -49,21 +49,22 @@ class AbstractSignal(eqx.Module):
     def keep(self) -> None:
         """Hook: keep the trace of a call; see `Captured`."""
 
-    @abc.abstractmethod
     def break_times(self, *, of_rates: bool) -> np.ndarray:
-        """Times [s] at which the value jumps; with `of_rates` also times at which its rate jumps."""
+        """Times [s] at which the value jumps; with `of_rates` also times at which its rate jumps. Default none: jumps
+        of a function are unknown here, and `simulate(..., jumps=)` gives them.
+        """
+        return np.zeros(0)
 
     @abc.abstractmethod
     def samples(self, t0: Scalar, t1: Scalar) -> Array:
         """Times [s], ascending, between which the value is assumed monotonic."""
 
-    @abc.abstractmethod
     def check_interval(self, label: str, t0: Scalar, t1: Scalar) -> None:
-        """Raise a `ValueError` if the value is not known from `t0` to `t1`, unless these are traced."""
+        """Hook: raise a `ValueError` if the value is not known from `t0` to `t1`, unless these are traced."""
 
-    @abc.abstractmethod
     def is_known(self, t0: Scalar, t1: Scalar) -> Any:
-        """Whether the value is known from `t0` to `t1`, up to rounding errors."""
+        """Whether the value is known from `t0` to `t1`, up to rounding errors; by default at all times."""
+        return True
 
     @property
     @abc.abstractmethod
@@ -207,18 +208,8 @@ class Signal(AbstractSignal):
     def keep(self):
         self.function.known.keep()
 
-    def break_times(self, *, of_rates):
-        # The jumps of a function are unknown here; `simulate(..., jumps=)` gives them.
-        return np.zeros(0)
-
     def samples(self, t0, t1):
         return sample_times(t0, t1)
-
-    def check_interval(self, label, t0, t1):
-        pass
-
-    def is_known(self, t0, t1):
-        return True
 
     @property
     def continuous(self):

@@ -126,17 +126,8 @@ class Piece(AbstractSignal):
             value = value * share + power
         return value
 
-    def break_times(self, *, of_rates):
-        return np.zeros(0)
-
     def samples(self, t0, t1):
         return jnp.stack([jnp.asarray(t0), jnp.asarray(t1)])
-
-    def check_interval(self, label, t0, t1):
-        pass
-
-    def is_known(self, t0, t1):
-        return True
 
     @property
     def continuous(self):
