@@ -1,7 +1,7 @@
 """Intervals and nodes of a plan, computed side by side: values, first and second derivatives by their inputs."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -68,18 +68,21 @@ class Model(eqx.Module):
         """The system with these values of designed parameters."""
         if not self.design:
             return self.system
-        return with_parameters(self.system, _by_name(self.design, numbers))
+        return with_parameters(self.system, by_name(self.design, numbers))
 
-    def given(self, t: Any, controls: dict[str, Array], numbers: Any) -> dict[str, Array]:
+    def given(self, controls: dict[str, Array], numbers: Any) -> dict[str, Array]:
         """The controls and designed parameters by name, for functions of an instant."""
-        del t
-        return {**controls, **_by_name(self.design, numbers)}
+        return {**controls, **by_name(self.design, numbers)}
 
 
-def _by_name(shapes, numbers):
-    sizes = [int(np.prod(shape, dtype=int)) for _, shape in shapes]
-    parts = jnp.split(numbers, np.cumsum(sizes)[:-1]) if sizes else []
-    return {name: part.reshape(shape) for (name, shape), part in zip(shapes, parts, strict=True)}
+def by_name(shapes: Iterable[tuple[str, tuple[int, ...]]], numbers: Any) -> dict[str, Any]:
+    """Arrays by name from their numbers, one after the other along axis 0; `shapes`: names and shapes."""
+    out, begin = {}, 0
+    for name, shape in shapes:
+        size = int(np.prod(shape, dtype=int))
+        out[name] = numbers[begin : begin + size].reshape((*shape, *numbers.shape[1:]))
+        begin += size
+    return out
 
 
 class AbstractLane(eqx.Module):
@@ -138,7 +141,7 @@ class Arrival(AbstractLane):
     def _cost(self, system, state, t, pieces, design):
         if self.running is None:
             return jnp.zeros(())
-        given = self.model.given(t, {name: piece(t) for name, piece in pieces.items()}, design)
+        given = self.model.given({name: piece(t) for name, piece in pieces.items()}, design)
         return jnp.asarray(self.running(Reading(system, state, t, given)))
 
 
@@ -165,7 +168,7 @@ class Look(AbstractLane):
         system = model.designed(design)
         system = with_parameters(system, controls) if controls else system
         state = Chart(system, *chart).state(t, x)
-        numbers = self.function(Reading(system, state, t, model.given(t, controls, design)))
+        numbers = self.function(Reading(system, state, t, model.given(controls, design)))
         return jnp.concatenate([jnp.ravel(jnp.asarray(number, x.dtype)) for number in jax.tree.leaves(numbers)])
 
 

@@ -20,7 +20,7 @@ from ...system import AbstractSystem, with_inputs, with_parameters
 from ...trajectory import Trajectory
 from ..evaluate import Reading
 from .guess import Guess, first_guess
-from .lanes import Model
+from .lanes import Model, by_name
 from .sensitivity import Sensitivity, derivatives, sensitivities
 from .solve import Iteration, Solution, solved
 from .task import Named, Task
@@ -81,11 +81,6 @@ class Plan(Printed):
         design = Model(task.system, task.controls, task.design)
         numbers = [x.reshape(-1, *c.shape) for c, x in zip(task.controls, found.controls, strict=True)]
         each = zip(task.controls, numbers, strict=True)
-        begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
-        values = {
-            name: found.design[a:b].reshape(shape)
-            for (name, shape), a, b in zip(task.design, begins[:-1], begins[1:], strict=True)
-        }
         problem = solution.transcription.problem
         return cls(
             system=design.designed(jnp.asarray(found.design)),
@@ -94,7 +89,7 @@ class Plan(Printed):
             ts=found.ts,
             states=found.states,
             controls={control.name: control.course.series(found.ts, own) for control, own in each},
-            parameters=values,
+            parameters=by_name(task.design, found.design),
             prices=_prices(solution),
             active=_active(solution),
             iterations=solution.iterations,
@@ -321,12 +316,7 @@ def _active(solution: Solution) -> tuple[str, ...]:
     free = problem.low < problem.high
     at_bound = free & (np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale)
     out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
-    begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
-    out += [
-        name
-        for (name, _), a, b in zip(task.design, begins[:-1], begins[1:], strict=True)
-        if at_bound[places.design[a:b]].any()
-    ]
+    out += [name for name, own in by_name(task.design, at_bound[places.design]).items() if own.any()]
     out += ["duration"] if not task.moving and task.timed and at_bound[places.times].any() else []
     if task.path.names:
         rows = transcription.rows_of["path"] - 1

@@ -14,6 +14,7 @@ from scipy.sparse import linalg
 
 from ...parts.names import unknown
 from ...system import parameters
+from .lanes import by_name
 from .problem import Problem
 from .solve import Solution
 from .transcription import Places, Transcription
@@ -147,11 +148,7 @@ def _read(solution, names, extended, moved, weights):
         of(moved[where].reshape(len(where), *control.shape, -1))
         for control, where in zip(task.controls, places.controls, strict=True)
     ]
-    begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for _, shape in task.design)])
-    designs = [
-        of(moved[places.design[a:b]].reshape(*shape, -1))
-        for (_, shape), a, b in zip(task.design, begins[:-1], begins[1:], strict=True)
-    ]
+    designs = [of(own) for own in by_name(task.design, moved[places.design]).values()]
     return {
         name: Sensitivity(
             objective[name],

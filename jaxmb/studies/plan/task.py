@@ -15,7 +15,7 @@ from ...system import AbstractSystem, parameters, with_inputs
 from ...system.quantities import component_names
 from ..evaluate import Reading
 from .courses import COURSES, Piece
-from .lanes import Control
+from .lanes import Control, by_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Limits:
 
     def by_name(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """The bounds of each quantity."""
-        begins = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in self.shapes)])
-        each = zip(self.names, self.shapes, begins[:-1], begins[1:], strict=True)
-        return {name: (self.low[a:b].reshape(shape), self.high[a:b].reshape(shape)) for name, shape, a, b in each}
+        shapes = list(zip(self.names, self.shapes, strict=True))
+        low, high = (by_name(shapes, side) for side in (self.low, self.high))
+        return {name: (low[name], high[name]) for name in low}
 
     @property
     def sizes(self) -> np.ndarray:
