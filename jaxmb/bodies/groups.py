@@ -391,7 +391,7 @@ class FlexibleGroup(BodyGroup):
         matrix, push = jax.linearize(functools.partial(self._matrix, part), zeta)
         along_modes = vector_products(jax.vmap(push)(jnp.eye(len(zeta), dtype=x.dtype)), w)
         momentum = vector_products(matrix, w)
-        # The velocity of a body that keeps it in world axes turns in the body's; gravity is an acceleration of the frame.
+        # A velocity that is constant in world axes turns in the body's; gravity is an acceleration of the frame.
         acceleration = -space.swept(spin, velocity)
         if gravity is not None:
             acceleration = acceleration - space.body_direction(x[0], gravity)
