@@ -373,9 +373,9 @@ class FlexibleGroup(BodyGroup):
 
         def single(at, x):
             matrix = self._matrix(self._numbers(at(0.0)), x[1:, 0])
-            turned = jax.vmap(functools.partial(self._space.body_direction, x[0]), out_axes=1)
-            to_body = jnp.eye(len(matrix), dtype=x.dtype).at[:d, :d].set(turned(jnp.eye(d, dtype=x.dtype)))
-            return to_body.T @ matrix @ to_body
+            turned = jax.vmap(functools.partial(self._space.direction, x[0]))
+            rows = jnp.concatenate([turned(matrix[:, :d]), matrix[:, d:]], axis=1)
+            return jnp.concatenate([turned(rows[:d].T), rows[d:].T], axis=1)
 
         return self._map(single, poses)
 
@@ -386,26 +386,28 @@ class FlexibleGroup(BodyGroup):
     def _wrenches(self, gravity, at, x, v):
         space, d, size = self._space, self._space.dimension, self._space.velocity_size
         part, kernel, zeta, rates = self._numbers(at(0.0)), self.group.kernel, x[1:, 0], v[1:, 0]
-        in_body = lambda pose, velocity: jnp.concatenate([space.body_direction(pose, velocity), v[0, d:], rates])
-        in_world = lambda pose, p: jnp.concatenate([space.direction(pose, p[:d]), p[d:]])
-
-        def momenta(pose, zeta):
-            return in_world(pose, self._matrix(part, zeta) @ in_body(pose, v[0, :d]))
-
-        w = in_body(x[0], v[0, :d])
-        momentum = self._matrix(part, zeta) @ w
-        _, rate = jax.jvp(momenta, (x[0], zeta), (space.rates(x[0], v[0]), rates))
-        origin = space.prepare(jnp.asarray(space.ground, x.dtype))
-        turning = space.force_at(origin, w[:d], momentum[:d])[d:]
-        if d == 3:
-            turning = turning + cross(w[3:6], momentum[3:6])
-        energy = lambda zeta: 0.5 * w @ self._matrix(part, zeta) @ w - kernel("energy")(part, zeta)
-        along = jax.grad(energy)(zeta) + kernel("internal_force")(part, zeta, rates)
-        force = jnp.concatenate([jnp.zeros(d, x.dtype), -turning, along]) - rate
+        velocity, spin = space.body_direction(x[0], v[0, :d]), v[0, d:]
+        w = jnp.concatenate([velocity, spin, rates])
+        matrix, push = jax.linearize(functools.partial(self._matrix, part), zeta)
+        along_modes = vector_products(jax.vmap(push)(jnp.eye(len(zeta), dtype=x.dtype)), w)
+        momentum = vector_products(matrix, w)
+        # A velocity that is constant in world axes turns in the body's; gravity is an acceleration of the frame.
+        acceleration = -space.swept(spin, velocity)
         if gravity is not None:
-            # A field of gravity is an acceleration of the frame.
-            falling = jnp.pad(space.body_direction(x[0], gravity), (0, len(momentum) - d))
-            force = force + in_world(x[0], self._matrix(part, zeta) @ falling)
+            acceleration = acceleration - space.body_direction(x[0], gravity)
+        rate = vector_products(along_modes.T, rates) + vector_products(matrix[:, :d], acceleration)
+        origin = space.prepare(jnp.asarray(space.ground, x.dtype))
+        turning = space.force_at(origin, velocity, momentum[:d])[d:]
+        if d == 3:
+            turning = turning + cross(spin, momentum[3:6])
+        elastic = kernel("internal_force")(part, zeta, rates) - jax.grad(lambda z: kernel("energy")(part, z))(zeta)
+        force = (
+            jnp.concatenate(
+                [-space.swept(spin, momentum[:d]), -turning, 0.5 * vector_products(along_modes, w) + elastic]
+            )
+            - rate
+        )
+        force = jnp.concatenate([space.direction(x[0], force[:d]), force[d:]])
         modal = jnp.pad(force[size:, None], ((0, 0), (0, size - 1)))
         return jnp.concatenate([force[None, :size], modal])
 

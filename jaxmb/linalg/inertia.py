@@ -119,18 +119,21 @@ class CoupledInertia(AbstractInertia):
     index: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
     def _apply(self, out, of_block, v):
+        columns = v.reshape(len(v), -1)
+        values, order, count = [out.reshape(columns.shape)], np.arange(len(v)), len(v)
         for blocks, index in zip(self.blocks, self.index, strict=True):
             place = np.array(index)
-            columns = unchecked_take(v.reshape(v.shape[0], -1), place)
-            values = jax.vmap(of_block)(blocks, columns).reshape(*place.shape, *v.shape[1:])
-            out = out.at[place].set(values, unique_indices=True, mode="promise_in_bounds")
-        return out
+            of_blocks = of_block(blocks, unchecked_take(columns, place))
+            values.append(of_blocks.reshape(place.size, -1))
+            order[place] = count + np.arange(place.size).reshape(place.shape)
+            count += place.size
+        return unchecked_take(jnp.concatenate(values), order).reshape(v.shape)
 
     def product(self, v):
-        return self._apply(self.rest.product(v), lambda M, x: M @ x, v)
+        return self._apply(self.rest.product(v), matrix_products, v)
 
     def solve(self, f):
-        return self._apply(self.rest.solve(f), solve_positive, f)
+        return self._apply(self.rest.solve(f), jax.vmap(solve_positive), f)
 
     def root(self):
         return CoupledInertia(self.rest.root(), tuple(jax.vmap(cholesky)(M) for M in self.blocks), self.index)

@@ -398,10 +398,14 @@ class AbstractActor(AbstractPart):
         if not self.modal_rows:
             return out
         start, end = self._modal_span
-        out = jnp.insert(out, np.full(end - start, start), 0.0, axis=0)
+        modal = jnp.zeros(end - start, out.dtype)
         for k, frame in self.body_frames.items():
             for zeta in frame.modal(poses):
-                out = out.at[slice(*frame.rows), 0].add(frame.modal_force(space, poses[int(k)], wrenches[int(k)], zeta))
+                first, last = frame.rows
+                force = frame.modal_force(space, poses[int(k)], wrenches[int(k)], zeta)
+                modal = modal + jnp.pad(force, (first - start, end - last))
+        rows = jnp.pad(modal[:, None], ((0, 0), (0, out.shape[1] - 1)))
+        out = jnp.concatenate([out[:start], rows, out[start:]])
         return out
 
     @property

@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..linalg.arrays import is_traced, namespace
+from ..linalg.blocks import vector_products
+from ..linalg.sums import unchecked_take
 from . import fields
 from .bar_shapes import BarShapes, bar_tables, shapes_at
 from .base import AbstractFlexibleBody, ScalarCoordinate
@@ -62,15 +64,15 @@ class ElasticNumbers(eqx.Module):
 
     def mass_matrix(self, space: AbstractSpace, zeta: Float[Array, "n"]) -> Float[Array, "m m"]:
         rows, columns = np.triu_indices(len(zeta))
-        return jnp.tensordot(
-            jnp.concatenate([jnp.ones_like(zeta[:1]), zeta, zeta[rows] * zeta[columns]]), self.terms, 1
-        )
+        products = unchecked_take(zeta, rows) * unchecked_take(zeta, columns)
+        factors = jnp.concatenate([jnp.ones_like(zeta[:1]), zeta, products])
+        return vector_products(self.terms.reshape(len(factors), -1).T, factors).reshape(self.terms.shape[1:])
 
     def energy(self, space: AbstractSpace, zeta: Float[Array, "n"]) -> Float[Array, ""]:
-        return 0.5 * zeta @ self.stiffness @ zeta
+        return 0.5 * vector_products(vector_products(self.stiffness, zeta)[None], zeta)[0]
 
     def internal_force(self, space: AbstractSpace, zeta: Float[Array, "n"], rates: Float[Array, "n"]):
-        return -self.damping @ rates
+        return -vector_products(self.damping, rates)
 
 
 def _inertia(d: int, second: Array) -> Float[Array, "... r r"]:
@@ -323,10 +325,10 @@ class AbstractElasticBar(AbstractElastic):
 
     def _line_moves(self, shapes: BarShapes):
         """Displacements of the centre line by unit coordinates, (s, d, n)."""
-        (s, _), d = shapes.bend.shape, self.dimension
-        across = np.einsum("ab,si->sabi", np.eye(d)[:, 1:], shapes.bend).reshape(s, d, -1)
-        along = shapes.stretch[:, None] * np.eye(d)[:, :1]
-        return np.concatenate([across, along, np.zeros((s, d, self.torsion))], axis=2)
+        xp, (s, _), d = namespace(shapes.bend), shapes.bend.shape, self.dimension
+        across = xp.einsum("ab,si->sabi", np.eye(d)[:, 1:], shapes.bend).reshape(s, d, -1)
+        along = shapes.stretch[:, None] * np.eye(d)[None, :, :1]
+        return xp.concatenate([across, along, np.zeros((s, d, self.torsion))], axis=2)
 
     @property
     def inertia(self):
@@ -375,8 +377,16 @@ class AbstractElasticBar(AbstractElastic):
 
     def section(self, station: Any, zeta: Float[Array, "n"]) -> tuple[Float[Array, "d"], Float[Array, "r"]]:
         """The place [m] of a section in the body's frame, and its turn [rad]."""
+        # Unrolled products, which compile to fewer kernels than general ones.
         shapes = shapes_at(self._tables, station[None])
-        return self._line(shapes, station[None], zeta)[0], self._section_turns(shapes)[0] @ zeta
+        moves, turns = self._line_moves(shapes)[0], self._section_turns(shapes)[0]
+        xp, d = namespace(moves, zeta, self.length), self.dimension
+        curving = xp.kron(np.eye(d - 1), shapes.shortening[0]) / (2 * self.length)
+        bends = zeta[: len(curving)]
+        drawn = vector_products(vector_products(curving, bends)[None], bends)
+        along = self.length * station - drawn
+        moved = vector_products(xp.concatenate([moves, turns]), zeta)
+        return xp.concatenate([along, np.zeros(d - 1)]) + moved[:d], moved[d:]
 
     def line(self, space, zeta):
         del space
