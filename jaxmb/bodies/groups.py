@@ -401,12 +401,8 @@ class FlexibleGroup(BodyGroup):
         if d == 3:
             turning = turning + cross(spin, momentum[3:6])
         elastic = kernel("internal_force")(part, zeta, rates) - jax.grad(lambda z: kernel("energy")(part, z))(zeta)
-        force = (
-            jnp.concatenate(
-                [-space.swept(spin, momentum[:d]), -turning, 0.5 * vector_products(along_modes, w) + elastic]
-            )
-            - rate
-        )
+        along = 0.5 * vector_products(along_modes, w) + elastic
+        force = jnp.concatenate([-space.swept(spin, momentum[:d]), -turning, along]) - rate
         force = jnp.concatenate([space.direction(x[0], force[:d]), force[d:]])
         modal = jnp.pad(force[size:, None], ((0, 0), (0, size - 1)))
         return jnp.concatenate([force[None, :size], modal])

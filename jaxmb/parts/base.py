@@ -405,8 +405,7 @@ class AbstractActor(AbstractPart):
                 force = frame.modal_force(space, poses[int(k)], wrenches[int(k)], zeta)
                 modal = modal + jnp.pad(force, (first - start, end - last))
         rows = jnp.pad(modal[:, None], ((0, 0), (0, out.shape[1] - 1)))
-        out = jnp.concatenate([out[:start], rows, out[start:]])
-        return out
+        return jnp.concatenate([out[:start], rows, out[start:]])
 
     @property
     def modal_rows(self) -> int:

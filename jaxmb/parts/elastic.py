@@ -40,6 +40,8 @@ _TURNS = {
 # The smallest eigenvalue of the products of modes of length one that do not depend on each other.
 _INDEPENDENT = 1e-12
 _MOST_MODES = 8
+# Sums of so many terms at most are written term by term.
+_UNROLLED = 64
 _RECTANGLE = ("width", "thickness")
 # The stations by which a picture shows a bar.
 _SHOWN = np.linspace(0.0, 1.0, 17)
@@ -66,7 +68,9 @@ class ElasticNumbers(eqx.Module):
         rows, columns = np.triu_indices(len(zeta))
         products = unchecked_take(zeta, rows) * unchecked_take(zeta, columns)
         factors = jnp.concatenate([jnp.ones_like(zeta[:1]), zeta, products])
-        return vector_products(self.terms.reshape(len(factors), -1).T, factors).reshape(self.terms.shape[1:])
+        terms = self.terms.reshape(len(factors), -1).T
+        product = vector_products if len(factors) <= _UNROLLED else jnp.matmul
+        return product(terms, factors).reshape(self.terms.shape[1:])
 
     def energy(self, space: AbstractSpace, zeta: Float[Array, "n"]) -> Float[Array, ""]:
         return 0.5 * vector_products(vector_products(self.stiffness, zeta)[None], zeta)[0]

@@ -785,7 +785,7 @@ FAULTS = [
     Fault("parts/spatial/kinematics.py", "turn / 2]))", "turn]))"),
     Fault("parts/nodal.py", "np.linalg.solve(system, moved)", "np.linalg.solve(system, -moved)"),
     Fault("linalg/inertia.py", "self._apply(self.rest.solve(f), jax.vmap(solve_positive), f)", "self.rest.solve(f)"),
-    Fault("bodies/groups.py", "momentum[:d]), -turning, 0.5", "momentum[:d]), turning, 0.5"),
+    Fault("bodies/groups.py", "momentum[:d]), -turning, along", "momentum[:d]), turning, along"),
     Fault("bodies/groups.py", "turning + cross(spin, momentum[3:6])", "turning - cross(spin, momentum[3:6])"),
     Fault("bodies/groups.py", "rates) - jax.grad(lambda", "rates) + jax.grad(lambda"),
     Fault("bodies/groups.py", "return energy - gravity @ (matrix", "return energy + gravity @ (matrix"),
