@@ -24,7 +24,10 @@ def imply_each_other(system: Any, q: Float[np.ndarray, "nq"]) -> bool:
     rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(rows.dtype).tiny)
     of_contacts, others = np.array(contacts.rows[: contacts.n]), np.delete(rows, contacts.rows, axis=0)
     closed = np.abs(on_host.residual(bound)[of_contacts]) <= _CLOSED * float(system.length)
-    return any(_dependent(rows[of_contacts[numbers]], others) for numbers in [np.flatnonzero(closed), *_pairs(system)])
+    # A disc inside a box has no normal.
+    normals, has_normal = rows[of_contacts], np.all(np.isfinite(rows[of_contacts]), axis=1)
+    candidates = (np.array(numbers)[has_normal[numbers]] for numbers in [np.flatnonzero(closed), *_pairs(system)])
+    return any(_dependent(normals[numbers], others) for numbers in candidates)
 
 
 def _pairs(system) -> list[list[int]]:

@@ -15,6 +15,7 @@ _HOW = (
 )
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _ITEM = re.compile(r" *(- |\d+\. )")
+_LINK = re.compile(r"\[([^\]]+)\]\([^)]+\.(?:md|ipynb)\)")
 _NEXT_ITEM = re.compile(r"\n(?= *(?:- |\d+\. ))")
 # A piece of code between fences, or the lines up to an empty line or a piece of code.
 _BLOCK = re.compile(r"^ *```.*\n(?P<code>(?:.*\n)*?) *```$|(?:^(?! *```) *\S.*(?:\n|\Z))+", re.M)
@@ -37,8 +38,9 @@ def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = Fal
 
 
 def shown_topic(topic: Topic, width: int = 80, styled: bool = False) -> str:
-    """The text of a topic."""
-    parts = [f"**{topic.title}**", *(block for block, _ in _filled(topic.text, width))]
+    """The text of a topic, without the addresses of links."""
+    text = _LINK.sub(r"\1", topic.text)
+    parts = [f"**{topic.title}**", *(block for block, _ in _filled(text, width))]
     return "\n\n".join(_styled(part, styled) for part in parts)
 
 

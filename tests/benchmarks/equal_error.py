@@ -1,4 +1,8 @@
-"""Times of several programs at equal error, and what machine they were measured on."""
+"""Times of several programs at equal error, and what machine they were measured on.
+
+Times are those of the processor, summed over the threads of the process, which other processes on the machine do not
+lengthen as they do the time that passes.
+"""
 
 import importlib.metadata
 import json
@@ -18,7 +22,7 @@ ERRORS = (1e-4, 1e-6, 1e-8)
 
 
 class Point(NamedTuple):
-    """One run: the `setting`, a tolerance or a step, its `error`, and its time [s]."""
+    """One run: the `setting`, a tolerance or a step, its `error`, and its processor time [s]."""
 
     setting: float
     error: float
@@ -42,16 +46,16 @@ def measured(
     seconds: Callable[[Any], float] | None = None,
 ) -> list[Point]:
     """The runs that end, with the shortest of `repeats` times of each, all settings in turns; with `seconds(result)`
-    instead of the time that passes.
+    instead of the time of the whole run.
     """
     settings = list(settings)
     errors = [error(jax.block_until_ready(run(setting))) for setting in settings]
     shortest = [np.inf] * len(settings)
     for _ in range(repeats):
         for k, setting in enumerate(settings):
-            begin = time.perf_counter()
+            begin = time.process_time()
             result = jax.block_until_ready(run(setting))
-            passed = time.perf_counter() - begin
+            passed = time.process_time() - begin
             shortest[k] = min(shortest[k], passed if seconds is None else seconds(result))
     return [Point(*point) for point in zip(settings, errors, shortest, strict=True) if np.isfinite(point[1])]
 

@@ -4,8 +4,8 @@ A four-bar linkage (a loop) and a pendulum of ten links (a tree), values and gra
 
     python tests/benchmarks/peers.py [--record FILE]
 
-on an otherwise idle machine; `NPROC=1 taskset -c 0` before it allows each of them one thread. What is not installed is
-left out: `pip install pin mujoco exudyn casadi`. Each program runs over its tolerances or its steps; from the curves
+Times are processor times; `NPROC=1 OMP_NUM_THREADS=1` before it allows each of them one thread. What is not installed
+is left out: `pip install pin mujoco exudyn casadi`. Each program runs over its tolerances or its steps; from the curves
 come the times at relative errors of 1e-4, 1e-6 and 1e-8 of an angle at the end, and of its derivative by a mass,
 where a program gets there. Compilation is not in the times. `--record` writes the curves as JSON, for the notebook on
 benchmarks: `--record notebooks/14_benchmarks.json`.
@@ -39,7 +39,7 @@ from equal_error import Curve, machine, measured, record, table
 import jaxmb as mb
 
 jax.config.update("jax_enable_x64", True)
-REPEATS = 5
+REPEATS = 3
 TOLERANCES = 10.0 ** -np.arange(3.0, 12.1)
 
 

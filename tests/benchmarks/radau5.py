@@ -66,9 +66,9 @@ def motion_of(equations: Equations) -> Callable[[float], Run]:
 
     def timed(function):
         def call(t, y):
-            begin = time.perf_counter()
+            begin = time.process_time()
             result = function(t, y)
-            seconds[0] += time.perf_counter() - begin
+            seconds[0] += time.process_time() - begin
             return result, known
 
         return call
@@ -88,9 +88,9 @@ def motion_of(equations: Equations) -> Callable[[float], Run]:
         tolerances = np.full(N, tolerance)
         options = (1, jacobian, 1, N, N, mass, 1, 0, 0, unused, 0, work, iwork)
         step = 1e-4 * equations.t1
-        seconds[0], begin = 0.0, time.perf_counter()
+        seconds[0], begin = 0.0, time.process_time()
         found = fortran.radau5(field, 0.0, start.copy(), equations.t1, step, tolerances, tolerances, *options)
-        own = time.perf_counter() - begin - seconds[0]
+        own = time.process_time() - begin - seconds[0]
         _, y, _, counts, code = found
         return Run(y[:n], y[n : 2 * n], int(counts[15]), int(counts[13]), own, code == 1)
 

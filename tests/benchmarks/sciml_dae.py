@@ -5,10 +5,9 @@ car axis, Fekete's particles on a sphere and the rail wheelset. The slider-crank
 
     python tests/benchmarks/sciml_dae.py [--record FILE] [andrews car_axis fekete wheelset]
 
-on an otherwise idle machine. Printed are scd, the number of correct digits of the worst component against the
-published end values; the largest relative error against better values, where there are any; steps and times of warm
-runs; and times at equal error, with their ratio. `--record notebooks/14_benchmarks.json` writes the curves for the
-notebook on benchmarks.
+Printed are scd, the number of correct digits of the worst component against the published end values; the largest
+relative error against better values, where there are any; steps and processor times of warm runs; and times at equal
+error, with their ratio. `--record notebooks/14_benchmarks.json` writes the curves for the notebook on benchmarks.
 
 RADAU5 has the form of index 3, with the indices of its variables given: of all solvers that SciMLBenchmarks tries on
 Andrews' squeezer (2026) it is the only one that comes through. It is Fortran (`pip install assimulo-testing`), and the

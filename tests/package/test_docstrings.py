@@ -272,8 +272,9 @@ def test_examples(name, names, request, tmp_path, monkeypatch):
 
 @pytest.mark.slow(but=("compiling",))
 @pytest.mark.parametrize("name", topics())
-def test_examples_of_topics(name, names, capsys, monkeypatch):
+def test_examples_of_topics(name, names, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(mb, "setup", lambda **_: None)
+    monkeypatch.chdir(tmp_path)
     code = codes(topics()[name].text)
     assert code
     scope = dict(names)

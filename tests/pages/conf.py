@@ -1,4 +1,4 @@
-"""Pages of all public names, topics and notebooks: `python -m sphinx -c tests/pages . FOLDER`, from the checkout."""
+"""Pages of all public names, topics and notebooks: `python -m tests.pages FOLDER`, from the checkout."""
 
 import re
 from pathlib import Path

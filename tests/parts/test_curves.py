@@ -1,11 +1,10 @@
 """Laws of parts without a machine: as written by hand, as in a motion, with derivatives, and wrong arguments."""
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from every_part import TYRE_FILE
 
 import jaxmb as mb
 from jaxmb import contact, planar, spatial, terrain
@@ -163,7 +162,7 @@ def test_forces_of_a_tyre_are_those_of_a_motion(kind):
         part = tyre(terrain=FLAT, transition_speed=1e-7, damping=0.0)
         lengths = lambda load: 0.2 * jnp.ones(2)
     else:
-        file = Path(__file__).parents[1] / "support" / "example_61.tir"
+        file = TYRE_FILE
         side = "right" if "right" in kind else None
         part = spatial.MagicFormulaTyre("tyre", "wheel", file, terrain=FLAT, side=side, transition_speed=1e-7)
         lengths = lambda load: magic_formula.Point(

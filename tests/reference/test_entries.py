@@ -6,7 +6,7 @@ import inspect
 import pytest
 
 import jaxmb as mb
-from jaxmb.reference import find, listed, shown, subjects, topics
+from jaxmb.reference import find, listed, shown, shown_topic, subjects, topics
 from jaxmb.reference.entries import entries, public_modules, public_names, results, signature
 
 MODULES = {"": mb, **public_modules()}
@@ -42,6 +42,11 @@ def test_topics_hide_no_public_name():
         # Unknown, or of several modules, as `names` is.
         with pytest.raises(ValueError, match=r"Unknown name|is the name of"):
             find(topic)
+
+
+def test_links_of_topics_are_words_in_a_terminal():
+    text = shown_topic(topics()["examples"])
+    assert "| 20_ropes |" in text and "right, sweeps, large" in " ".join(text.split()) and ".ipynb" not in text
 
 
 def test_entries_have_docstrings():

@@ -36,6 +36,17 @@ def shares(bodies, joints):
     return isinstance(mb.Scene(bodies, joints=joints).compile().contacts.sharing, Sharing)
 
 
+def test_disc_inside_one_of_several_boxes_is_refused_by_name():
+    """It has no normal there."""
+    wheel = planar.Body("wheel", mass=1.0, inertia=planar.disc(1.0, 0.1), position=(2.2, 0.05))
+    box = lambda k: mb.RigidBoxContact(
+        f"step {k}", "ground", "wheel", size=(1.0, 0.5), point_a=(2.0 + k, 0.0), radius=0.1
+    )
+    system = mb.Scene([wheel], joints=[box(0), box(1)]).compile()
+    with pytest.raises(ValueError, match=r"beyond contacts.*step 0 by 0.1"):
+        mb.simulate(system, mb.assemble(system), t1=0.1)
+
+
 def test_which_contacts_are_known_to_share():
     """Those of one body, also while they are open and tilted."""
     assert isinstance(on_ropes().contacts.sharing, Sharing)

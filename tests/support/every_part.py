@@ -122,7 +122,7 @@ TYRE_2D = {
     "smoothing": 0.02,
 }
 # The example of a tyre on the scale of these bodies, with wide limits.
-TYRE_FILE = Path(__file__).parent / "example_61.tir"
+TYRE_FILE = Path(__file__).parents[2] / "notebooks" / "tyre_61.tir"
 TYRE_3D = tir.read("", TYRE_FILE).coefficients | {
     "FITTYP": 61,
     "TYRESIDE": "left",

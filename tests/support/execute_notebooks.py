@@ -1,9 +1,10 @@
 """Execute notebooks, and record in them what was executed: `python tests/support/execute_notebooks.py [name …]`.
 
-Without names all notebooks are executed, and the README's pictures are made: `work_precision`, `four_bar` and those of
-`GALLERY`. A notebook keeps the version of jaxmb and a digest of each code cell as it was executed; `test_notebooks.py`
-compares them with the package and with the cells, and in its long tests what is printed with what a new execution
-prints. Cells with the tag `varies` print what differs between machines and runs, such as times, and are not compared.
+Without names all notebooks are executed, and the README's pictures are made: `work_precision`, `four_bar`, `sliders`,
+which needs Chromium, and those of `GALLERY`. A notebook keeps the version of jaxmb and a digest of each code cell as it
+was executed; `test_notebooks.py` compares them with the package and with the cells, and in its long tests what is
+printed with what a new execution prints. Cells with the tag `varies` print what differs between machines and runs, such
+as times, and are not compared.
 """
 
 import base64
@@ -12,9 +13,11 @@ import io
 import json
 import re
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
+import chromium
 import equinox as eqx
 import jax
 import nbformat
@@ -33,6 +36,10 @@ GALLERY = {
     "worst_loads": ("16_loads", "loads-11"),
     "coupler_point": ("09_design_and_stability", "cell8"),
     "bicycle": ("09_design_and_stability", "cell12"),
+    "belt": ("20_ropes", "ropes-13"),
+    "trailer": ("21_wheels", "wheels-09"),
+    "robot": ("22_handling", "handling-09"),
+    "geneva": ("22_handling", "handling-13"),
 }
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?(?![\w])", re.IGNORECASE)
 
@@ -138,7 +145,7 @@ def picture(name: str, path: Path) -> None:
     (data,) = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
     shown = Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
     shown.thumbnail((640, 480), Image.Resampling.LANCZOS)
-    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(path, optimize=True)
+    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=256).save(path, optimize=True)
 
 
 def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
@@ -158,14 +165,39 @@ def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
     )
 
 
+def sliders(path: Path) -> None:
+    """A PNG of a page of `viz.explore`: one joint turned, the rest as at the start."""
+    linkage = jaxmb.mechanisms.four_bar()
+    bounds = {"coupler.mass": (1.0, 5.0), "B.point_b[0]": (-3.0, -0.2)}
+    explorer = jaxmb.viz.explore(linkage.system, bounds, quantities="rocker.angle", state=linkage.state, t1=2.0)
+    with tempfile.TemporaryDirectory() as folder, chromium.browser(Path(folder), 1040, 726) as page:
+        page.go_online()
+        page.call("Page.navigate", url=explorer.url)
+        page.wait("document.querySelectorAll('.mantine-Slider-root').length == 4")
+        page.hide_notices()
+        explorer.set({"A.angle": 1.0})
+        page.picture()
+        x, y, width, height = page.value(
+            "(() => { const b = document.querySelector('.mantine-Slider-root').getBoundingClientRect(); "
+            "return [b.x, b.y, b.width, b.height]; })()"
+        )
+        page.click(x + 0.2 * width, y + height / 2)
+        shown = Image.fromarray((255 * page.picture()).round().astype("uint8"))
+    explorer.close()
+    shown.thumbnail((800, 600), Image.Resampling.LANCZOS)
+    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=256).save(path, optimize=True)
+
+
 def main(names: list[str]) -> None:
     known = {path.stem: path for path in sorted(FOLDER.glob("*.ipynb"))}
-    for name in names or [*known, "work_precision", "four_bar", *GALLERY]:
+    for name in names or [*known, "work_precision", "four_bar", "sliders", *GALLERY]:
         print(name, flush=True)
         if name == "work_precision":
             jaxmb.report.work_precision(jaxmb.mechanisms.get("andrews")).figure(FOLDER / f"{name}.png")
         elif name == "four_bar":
             moving_picture(readme_machine()["motion"](2.0), FOLDER / f"{name}.gif")
+        elif name == "sliders":
+            sliders(FOLDER / f"{name}.png")
         elif name in GALLERY:
             picture(name, FOLDER / f"{name}.png")
         else:

@@ -1,117 +1,13 @@
 """Pages of moving pictures in a browser without a network: they load, they show something, and it moves."""
 
-import base64
-import contextlib
-import io
-import json
-import os
-import shutil
-import signal
-import subprocess
 import time
-import urllib.request
 
-import matplotlib.image
 import nbformat
 import numpy as np
 import pytest
+from chromium import CHROMIUM, browser
 
 import jaxmb as mb
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-_OPTIONS = (
-    "headless no-sandbox disable-gpu disable-quic no-first-run disable-background-networking disable-component-update "
-    "disable-sync disable-extensions enable-unsafe-swiftshader use-angle=swiftshader hide-scrollbars "
-    "remote-debugging-port=0 window-size=900,620"
-)
-
-# True once the page has drawn this many times: a picture taken while it is busy, as with its first, is an old one.
-_DRAWN = (
-    "new Promise(done => { let left = 10; "
-    "const next = () => left-- ? requestAnimationFrame(next) : done(true); next(); })"
-)
-
-
-class Browser:
-    """One page; `requests`: what it asked for, `complaints`: errors that it reported."""
-
-    def __init__(self, socket):
-        self._socket, self._count = socket, 0
-        self.requests, self.complaints = [], []
-        for domain in ("Page", "Network", "Runtime"):
-            self.call(f"{domain}.enable")
-        self.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
-
-    def call(self, method, **parameters):
-        self._count += 1
-        self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
-        while True:
-            message = json.loads(self._socket.recv(timeout=120))
-            if message.get("id") == self._count:
-                assert "error" not in message, message
-                return message["result"]
-            if message["method"] == "Network.requestWillBeSent":
-                self.requests.append(message["params"]["request"]["url"])
-            if message["method"] == "Runtime.exceptionThrown":
-                self.complaints.append(message["params"]["exceptionDetails"])
-
-    def open(self, path, query=""):
-        self.call("Page.navigate", url=path.resolve().as_uri() + query)
-
-    def value(self, expression):
-        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
-
-    def wait(self, expression, seconds=90):
-        """Until an expression is true."""
-        end = time.monotonic() + seconds
-        while not self.value(expression):
-            assert time.monotonic() < end, f"{expression}; {self.complaints}"
-            time.sleep(0.2)
-
-    def click(self, x, y):
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def picture(self):
-        """What is seen, shape (height, width, 3), from 0 to 1, when it no longer changes."""
-        last = None
-        for _ in range(40):
-            now = self._seen()
-            if last is not None and np.array_equal(now, last):
-                return now
-            last = now
-            time.sleep(1.0)
-        raise AssertionError("The picture does not come to rest.")
-
-    def _seen(self):
-        self.call("Runtime.evaluate", expression=_DRAWN, awaitPromise=True)
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        return matplotlib.image.imread(io.BytesIO(base64.b64decode(data)))[..., :3]
-
-
-@contextlib.contextmanager
-def browser(folder):
-    """An open browser; `folder`: for its profile."""
-    from websockets.sync.client import connect
-
-    words = [CHROMIUM, *(f"--{option}" for option in _OPTIONS.split()), f"--user-data-dir={folder}", "about:blank"]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        where = folder / "DevToolsActivePort"
-        for _ in range(300):
-            if where.exists() and where.read_text():
-                break
-            time.sleep(0.2)
-        port = where.read_text().split()[0]
-        direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-        with direct.open(f"http://127.0.0.1:{port}/json/list") as listed:
-            page = next(own for own in json.load(listed) if own["type"] == "page")
-        with connect(page["webSocketDebuggerUrl"], max_size=None, proxy=None) as socket:
-            yield Browser(socket)
-    finally:
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait()
-
 
 pytestmark = [
     pytest.mark.slow,
@@ -146,11 +42,7 @@ def page(tmp_path):
 def check_it_plays(page):
     """It shows more than a ground; another time looks different, and the first one again as before."""
     page.wait(LOADED)
-    # A notice of software rendering would come at any time.
-    page.value(
-        f"(() => {{ const own = {DOCUMENT}; const style = own.createElement('style'); "
-        "style.textContent = '.mantine-Notification-root {display: none}'; own.head.append(style); })()"
-    )
+    page.hide_notices(DOCUMENT)
     box = page.value(
         f"(() => {{ const a = document.querySelector('iframe')?.getBoundingClientRect() ?? {{x: 0, y: 0}}; "
         f"const b = {SLIDER}.getBoundingClientRect(); "
@@ -206,7 +98,7 @@ mb.viz.show(motion, points=["bar"])
 @pytest.mark.parametrize("in_a_cell", [False, True])
 def test_explorer_moves_with_its_sliders(in_a_cell, motions, page, tmp_path):
     """On its page, and in the frame of a notebook's cell: a slider that a user moves changes picture and curve."""
-    page.call("Network.emulateNetworkConditions", offline=False, latency=0, downloadThroughput=-1, uploadThroughput=-1)
+    page.go_online()
     system, bounds = motions["four_bar"].system, {"coupler.mass": (1.0, 5.0)}
     explorer = mb.viz.explore(
         system, bounds, state=mb.mechanisms.get("four_bar").state, quantities="rocker.angle", t1=1.0
@@ -216,14 +108,14 @@ def test_explorer_moves_with_its_sliders(in_a_cell, motions, page, tmp_path):
         cell.write_text(f"<html><body>{explorer._repr_html_()}</body></html>")
         page.call("Page.navigate", url=cell.as_uri() if in_a_cell else explorer.url)
         end = time.monotonic() + 120
-        while len(np.unique((page._seen().reshape(-1, 3) * 16).round(), axis=0)) < 40:
+        while len(np.unique((page.seen().reshape(-1, 3) * 16).round(), axis=0)) < 40:
             assert time.monotonic() < end
             time.sleep(0.5)
         first = page.picture()
         explorer.set({"A.angle": 0.4})
         # The linkage at the left, and at the right the slider, the numbers and the curve.
         for side in (slice(400), slice(500, None)):
-            while np.count_nonzero(np.abs(page._seen() - first)[:, side].max(axis=-1) > 0.1) < 300:
+            while np.count_nonzero(np.abs(page.seen() - first)[:, side].max(axis=-1) > 0.1) < 300:
                 assert time.monotonic() < end
                 time.sleep(0.5)
         if not in_a_cell:

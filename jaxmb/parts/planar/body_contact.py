@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...linalg.rotations import norm
+from ...linalg.rotations import from_axis_angle, norm
 from .. import fields
 from ..base import AbstractPlanarPart, AbstractPotentialForce
 from ..contact import AbstractFrictionLaw, AbstractNormalLaw
+from ..shapes import Box
 from ..smooth import ramp, step, without_pull
 from ..space import round_shapes
 
@@ -242,6 +243,13 @@ class PlateContact(AbstractBodyContact):
     def surfaces(self):
         return self._rows(self.start, (2,)), self._rows(self.end, (2,))
 
+    def shapes(self, space, size):
+        # The bodies of a chain are plates themselves.
+        plates = [] if self.chain else zip(*map(np.asarray, self.surfaces()), strict=True)
+        return super().shapes(space, size) + tuple(
+            (1 + k, _drawn(space, start, end, size)) for k, (start, end) in enumerate(plates)
+        )
+
     def distance(self, place, surface):
         (_, across), _ = _along(place, *surface)
         return jnp.abs(across)
@@ -315,6 +323,13 @@ class PlateContact(AbstractBodyContact):
 
         on_first = losses[0] + on_plate(poses[0], first, on_first, ends[0])
         return on_disc, on_first, losses[1] + on_plate(poses[1], second, on_second, starts[1])
+
+
+def _drawn(space, start, end, size):
+    """A plate as a picture shows it, as thick as half a bar."""
+    length, angle = np.linalg.norm(end - start), np.arctan2(*(end - start)[::-1])
+    turn = from_axis_angle((0.0, 0.0, 1.0), angle)
+    return Box((length, size, size), position=space.in_space((start + end) / 2), orientation=turn)
 
 
 def _along(place, start, end):

@@ -261,3 +261,16 @@ def test_a_disc_and_a_plate_of_one_body():
         part = planar.PlateContact("touch", names, radius=0.1, **SHARP, **both)
         with pytest.raises(ValueError, match="PlateContact 'touch' connects 'ball' with itself"):
             mb.Scene(bodies, forces=[part]).compile()
+
+
+def test_plates_are_drawn_from_start_to_end():
+    ends = {"start": [(0.0, 0.1), (1.0, 0.0), (0.0, 0.0)], "end": [(0.6, 0.9), (-1.0, 0.0), (0.0, 3.0)]}
+    part = plate(["a", "b", "b", "c"], **ends, **SHARP).resolve(PLANE, np.zeros((4, 3)))
+    plates = [(k, shape) for k, shape in part.shapes(PLANE, 0.01) if k > 0]
+    assert [k for k, _ in plates] == [1, 2, 3]
+    for (_, shape), start, end in zip(plates, *ends.values(), strict=True):
+        e0, _, _, e3 = shape.orientation
+        direction = np.array([e0**2 - e3**2, 2 * e0 * e3])
+        np.testing.assert_allclose(shape.scale[0] * direction, np.subtract(end, start), atol=1e-12)
+        np.testing.assert_allclose(shape.position[:2], np.add(start, end) / 2)
+    assert all(k == 0 for k, _ in roof(**SHARP, chain=True).resolve(PLANE, np.zeros((4, 3))).shapes(PLANE, 0.01))

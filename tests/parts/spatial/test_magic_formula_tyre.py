@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import jit_quickly
+from every_part import TYRE_FILE
 from oracles import magic_formula as oracle
 
 import jaxmb as mb
@@ -15,7 +16,7 @@ from jaxmb.linalg import rotations as rot
 from jaxmb.parts import tir
 
 FOLDER = Path(oracle.__file__).parents[1]
-FILES = {"5.2": FOLDER / "example_52.tir", "6.1": FOLDER / "example_61.tir"}
+FILES = {"5.2": FOLDER / "example_52.tir", "6.1": TYRE_FILE}
 VERSIONS = pytest.mark.parametrize("version", FILES)
 R0 = {"5.2": 0.32, "6.1": 0.32 * 0.997}
 GRAVITY = mb.Gravity((0.0, 0.0, -9.81))
