@@ -145,7 +145,7 @@ def picture(name: str, path: Path) -> None:
     (data,) = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
     shown = Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
     shown.thumbnail((640, 480), Image.Resampling.LANCZOS)
-    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=256).save(path, optimize=True)
+    shown.save(path, optimize=True)
 
 
 def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
@@ -185,7 +185,7 @@ def sliders(path: Path) -> None:
         shown = Image.fromarray((255 * page.picture()).round().astype("uint8"))
     explorer.close()
     shown.thumbnail((800, 600), Image.Resampling.LANCZOS)
-    shown.convert("P", palette=Image.Palette.ADAPTIVE, colors=256).save(path, optimize=True)
+    shown.save(path, optimize=True)
 
 
 def main(names: list[str]) -> None:
