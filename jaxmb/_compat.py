@@ -27,7 +27,7 @@ from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
 from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend import core
+from jax.extend import core, source_info_util
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.interpreters.ad import Zero
@@ -82,6 +82,14 @@ def is_of_jax(primitive: Primitive) -> bool:
     """
     module = getattr(getattr(primitive, "impl", None), "__module__", None) or "jax"
     return module.split(".")[0] in ("jax", "functools")
+
+
+def place_of(source_info: Any) -> str:
+    """Where an equation stands in the code of a user or a package: file, line and function; empty if unknown.
+
+    (jax.extend.source_info_util.summarize, and Equation.source_info, 0.9 to 0.12.)
+    """
+    return "" if source_info is None else source_info_util.summarize(source_info).rpartition("/")[2]
 
 
 def not_inlined() -> Any:
