@@ -22,7 +22,7 @@ _FUNCTIONS = {
 # Of single numbers in double precision.
 _OF_ONE = {"sin": "sine", "cos": "cosine", "sqrt": "root", "exp": "power_of_e", "abs": "abs", "is_finite": "isfinite"}
 # JAX copies arrays, and holds back derivatives and the compiler, where nothing is computed.
-_SAME = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
+_SAME = ("copy", "stop_gradient", "optimization_barrier")
 
 
 def scalars(values: list[Value]) -> bool:
@@ -149,19 +149,19 @@ def _integer_pow(t, e, values):
 
 @rule("pow")
 def _pow(t, e, values):
+    """NumPy takes a root for the power of one half, which differs for -0.0 and -inf, unless it stands in an array."""
     x, y = values[0], t.converted(values[1], values[0].dtype)
-    return t.elementwise(f"np.power({x.name}, {y.name})", [x, y], x.dtype)
+    if scalars([x, y]):
+        return t.elementwise(f"power({x.name}, {y.name})", [x, y], x.dtype)
+    return t.elementwise(f"np.power({x.name}, {(y := t.full(y)).name})", [x, y], x.dtype)
 
 
 @rule("lt_to", "le_to")
 def _total_order(t, e, values):
-    """The order of a sort: all NaN are the same, behind all numbers, and so are zeros of both signs."""
-    a, b = values
-    if e.primitive.name == "lt_to":
-        text = f"({a.name} < {b.name}) | (({b.name} != {b.name}) & ({a.name} == {a.name}))"
-    else:
-        text = f"({a.name} <= {b.name}) | ({b.name} != {b.name})"
-    return t.elementwise(text, values, np.dtype(bool))
+    """By bits: -NaN, numbers with -0.0 before 0.0, NaN."""
+    word, real = {"lt_to": "<", "le_to": "<="}[e.primitive.name], np.dtype(values[0].dtype).kind == "f"
+    a, b = (f"rank({x.name})" if real else x.name for x in values)
+    return t.elementwise(f"{a} {word} {b}", values, np.dtype(bool))
 
 
 @rule("round")

@@ -39,7 +39,7 @@ def _broadcast(t, e, values):
     return t.put(f"{x.name}.reshape({real})", values, shape, x.dtype, real)
 
 
-@rule("reshape", "squeeze", "expand_dims")
+@rule("reshape", "squeeze")
 def _reshape(t, e, values):
     if e.params.get("dimensions") is not None and e.primitive.name == "reshape":
         raise Unsupported("reshape in another order")

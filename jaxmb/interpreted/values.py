@@ -24,6 +24,14 @@ def _of_one(quick: Callable[[float], float], name: str) -> Callable[[Any], Any]:
     return of_one
 
 
+def power(x: Any, y: Any) -> Any:
+    """The power of a number."""
+    try:
+        return x.dtype.type(math.pow(x, y))
+    except (ValueError, OverflowError):
+        return np.power(np.full(1, x), np.full(1, y))[0]
+
+
 def larger(a: Any, b: Any) -> Any:
     """The maximum of two numbers, NaN if either is."""
     return a if a > b or a != a else b
@@ -71,6 +79,12 @@ def rounded_away(x: Any) -> Any:
 def sign(x: Any) -> Any:
     """The sign, with the sign of a zero, and NaN for NaN."""
     return np.where((x == 0) | (x != x), x, np.sign(x)).astype(x.dtype)[()]
+
+
+def rank(x: Any) -> Any:
+    """An integer that orders floats by their bits."""
+    bits = np.asarray(x).view(np.dtype(f"int{8 * x.itemsize}"))
+    return np.where(bits < 0, bits ^ np.iinfo(bits.dtype).max, bits)[()]
 
 
 def logistic(x: Any) -> Any:
@@ -236,7 +250,7 @@ GLOBALS: dict[str, Any] = {
     "power_of_e": _of_one(math.exp, "exp"),
     **{
         function.__name__: function
-        for function in (larger, smaller, to_integer, divided, remainder, rounded_away, sign, logistic, full, padded)
+        for function in (power, larger, smaller, to_integer, divided, remainder, rounded_away, sign, rank, logistic, full, padded)
     },
     **{
         function.__name__: function
