@@ -13,18 +13,19 @@ from .translate import Translator, Unsupported
 class Interpreted(NamedTuple):
     """A program of JAX as a function of arrays, in the order of its operands, that returns the arrays of its results.
 
-    **Fields:** the `function` of NumPy, the types of its results (`kinds`), and `text`, which gives its source.
+    **Fields:** the `function` of NumPy, the types of what it has `taken` and `given`, and `text`, which gives its source.
     """
 
     function: Callable[..., tuple[Any, ...]]
-    kinds: list[Any]
+    taken: list[Any]
+    given: list[Any]
     text: Callable[[Callable[[Any], str]], str]
 
     def __call__(self, arrays: Sequence[Any]) -> list[np.ndarray]:
-        host = [x if x.ndim else x[()] for x in map(np.asarray, arrays)]
+        host = [np.asarray(x, kind.dtype) for x, kind in zip(arrays, self.taken, strict=True)]
         with np.errstate(all="ignore"):
-            out = self.function(*host)
-        return [np.asarray(x, kind.dtype) for x, kind in zip(out, self.kinds, strict=True)]
+            out = self.function(*(x if x.ndim else x[()] for x in host))
+        return [np.asarray(x, kind.dtype) for x, kind in zip(out, self.given, strict=True)]
 
     @property
     def source(self) -> str:
@@ -38,7 +39,6 @@ def interpreted(program: Any) -> Interpreted:
     **Raises:** `Unsupported` for a program with operations that only the compiler knows.
     """
     t = Translator()
-    kinds = list(program.out_avals)
     given = [t.variable(aval, 0) for aval in program.in_avals]
     out = [t.full(x).name for x in t.program(program, given)]
     lines, live = Used(t.block.lines), set(out)
@@ -53,4 +53,4 @@ def interpreted(program: Any) -> Interpreted:
     except (SyntaxError, RecursionError) as error:
         # Python limits how deep blocks stand in each other.
         raise Unsupported(f"a program that Python does not compile, {error}") from error
-    return Interpreted(t.globals["program"], kinds, text)
+    return Interpreted(t.globals["program"], list(program.in_avals), list(program.out_avals), text)
