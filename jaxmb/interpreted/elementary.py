@@ -7,17 +7,31 @@ import numpy as np
 from .translate import Translator, Unsupported, Value, rule
 
 _INFIX = {
-    **{"add": "+", "add_any": "+", "sub": "-", "mul": "*"},
-    **{"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="},
+    "add": "+",
+    "add_any": "+",
+    "sub": "-",
+    "mul": "*",
+    "lt": "<",
+    "le": "<=",
+    "gt": ">",
+    "ge": ">=",
+    "eq": "==",
+    "ne": "!=",
 }
 # The function of arrays, for the operations that have the same name or another in NumPy.
 _FUNCTIONS = {
     **{name: f"np.{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "log", "sqrt")},
     **{name: f"np.{name}" for name in ("log1p", "expm1", "cbrt", "floor", "ceil", "abs", "nextafter")},
     **{f"a{name}": f"np.arc{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    **{"atan2": "np.arctan2", "is_finite": "np.isfinite", "sign": "sign", "logistic": "logistic"},
-    **{"erf": "special.erf", "erfc": "special.erfc", "erf_inv": "special.erfinv"},
-    **{"lgamma": "special.gammaln", "digamma": "special.digamma"},
+    "atan2": "np.arctan2",
+    "is_finite": "np.isfinite",
+    "sign": "sign",
+    "logistic": "logistic",
+    "erf": "special.erf",
+    "erfc": "special.erfc",
+    "erf_inv": "special.erfinv",
+    "lgamma": "special.gammaln",
+    "digamma": "special.digamma",
 }
 # Of single numbers in double precision.
 _OF_ONE = {"sin": "sine", "cos": "cosine", "sqrt": "root", "exp": "power_of_e", "abs": "abs", "is_finite": "isfinite"}
@@ -135,7 +149,8 @@ def _integer_pow(t, e, values):
     (x,), exponent = values, int(e.params["y"])
     if exponent == 0:
         return t.constant(np.ones((), x.dtype))._replace(shape=x.shape)
-    out, square, left = None, x, abs(exponent)
+    out: Any = None
+    square, left = x, abs(exponent)
     while left:
         if left & 1:
             out = square if out is None else product(t, out, square)

@@ -37,9 +37,9 @@ class Break(NamedTuple):
 
 
 class Branch(NamedTuple):
-    """The branch that the `index` names, the nearest one for an index out of bounds; `truth`: whether it is one."""
+    """The branch that the number `which` names, or the nearest; `truth`: whether it is a truth value."""
 
-    index: str
+    which: str
     branches: list[list[Any]]
     truth: bool
 
@@ -67,7 +67,7 @@ class Used:
 
     def _spread(self, lines):
         """Find more names of arrays that are updated; whether there were more."""
-        more = set()
+        more, grows = set(), False
         for line in lines:
             match line:
                 case Let(name=name, updates=updates) if updates:
@@ -77,15 +77,13 @@ class Used:
                         if self.buffers & set(pair):
                             more |= set(pair)
                 case Branch(branches=branches):
-                    # Not a generator, which would stop at the first.
-                    if any([self._spread(branch) for branch in branches]):
-                        more.add("")
+                    for branch in branches:
+                        grows = self._spread(branch) or grows
                 case Loop(body=body):
-                    if self._spread(body):
-                        more.add("")
-        found = more - {""} - self.buffers
+                    grows = self._spread(body) or grows
+        found = more - self.buffers
         self.buffers |= found
-        return bool(found) or "" in more
+        return bool(found) or grows
 
     def of(self, lines: list[Line], live: set[str], ends: set[str]) -> list[str | tuple[Line, Any]]:
         """Lines that matter, each with what is needed to write it; `live`, the names used later, becomes the names
@@ -121,13 +119,13 @@ class Used:
                 case Break(test=test):
                     live |= ends | {test}
                     out.append((line, None))
-                case Branch(index=index, branches=branches):
+                case Branch(which=which, branches=branches):
                     each = [set(live) for _ in branches]
                     inner = [self.of(branch, names, ends) for branch, names in zip(branches, each, strict=True)]
                     live.clear()
                     live.update(*each)
                     if any(inner):
-                        live.add(index)
+                        live.add(which)
                         out.append((line, inner))
                 case Loop(body=body):
                     after = set(live)
@@ -160,12 +158,16 @@ def written(lines: list[Any], said: Any, depth: int = 1) -> list[str]:
                 out.append(f"{pad}{rows}.append({value})")
             case Break(test=test):
                 out.append(f"{pad}if not {test}: break")
-            case Branch(index=index, truth=truth):
+            case Branch(which=which, truth=truth):
                 last = len(more) - 1
-                order = [(index, more[1]), ("", more[0])] if truth else [
-                    (f"{index} <= 0" if k == 0 else f"{index} == {k}" if k < last else "", branch)
-                    for k, branch in enumerate(more)
-                ]
+                order = (
+                    [(which, more[1]), ("", more[0])]
+                    if truth
+                    else [
+                        (f"{which} <= 0" if k == 0 else f"{which} == {k}" if k < last else "", branch)
+                        for k, branch in enumerate(more)
+                    ]
+                )
                 for k, (test, branch) in enumerate(order):
                     out.append(f"{pad}else:" if not test else f"{pad}{'elif' if k else 'if'} {test}:")
                     out += written(branch, said, depth + 1)

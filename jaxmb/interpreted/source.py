@@ -13,7 +13,7 @@ from .translate import Translator, Unsupported
 class Interpreted(NamedTuple):
     """A program of JAX as a function of arrays, in the order of its operands, that returns the arrays of its results.
 
-    **Fields:** the `function` of NumPy, the types of what it has `taken` and `given`, and `text`, which gives its source.
+    **Fields:** the `function` of NumPy, the types of what it has `taken` and `given`, and its source, by `text`.
     """
 
     function: Callable[..., tuple[Any, ...]]

@@ -9,8 +9,13 @@ import numpy as np
 from .translate import Translator, Value, rule
 
 _REDUCED = {
-    **{"reduce_sum": "add", "reduce_prod": "multiply", "reduce_max": "maximum", "reduce_min": "minimum"},
-    **{"reduce_and": "bitwise_and", "reduce_or": "bitwise_or", "reduce_xor": "bitwise_xor"},
+    "reduce_sum": "add",
+    "reduce_prod": "multiply",
+    "reduce_max": "maximum",
+    "reduce_min": "minimum",
+    "reduce_and": "bitwise_and",
+    "reduce_or": "bitwise_or",
+    "reduce_xor": "bitwise_xor",
 }
 # So many numbers are added one by one.
 _FEW = 3

@@ -14,7 +14,8 @@ from . import values
 from .lines import Let, Line
 
 # The types of numbers that NumPy computes with as XLA does.
-_TYPES = {np.dtype(name) for name in ("bool", "float64", "float32", *(f"{s}int{n}" for s in ("", "u") for n in (8, 16, 32, 64)))}
+_INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
+_TYPES = {np.dtype(name) for name in ("bool", "float64", "float32", *_INTEGERS)}
 # Constants up to this size are compared by their entries; so many entries at most are computed beforehand.
 _SMALL, _MOST = 4096, 100_000
 
@@ -45,7 +46,7 @@ class Value(NamedTuple):
 
 
 class Block:
-    """The lines of a block of source within an `outer` block, in `level` loops; and values by the text they come from."""
+    """The lines of a block of source within an `outer` one, in `level` loops; and values by the text they come from."""
 
     def __init__(self, level: int = 0, outer: "Block | None" = None):
         self.level, self.outer = level, outer
@@ -111,7 +112,9 @@ class Translator:
         name = f"np.{np.dtype(dtype).name}"
         return "np.bool_" if name == "np.bool" else name
 
-    def put(self, text: str, uses: Sequence[Value], shape: Any, dtype: Any, real: Any = None, updates: str = "") -> Value:
+    def put(
+        self, text: str, uses: Sequence[Value], shape: Any, dtype: Any, real: Any = None, updates: str = ""
+    ) -> Value:
         """The value of an expression.
 
         **Arguments:** `uses`: the values in it; `real`: the shape in NumPy, by default `shape`; `updates`: the name of
@@ -160,7 +163,11 @@ class Translator:
         of_variable |= zip(jaxpr.invars, given, strict=True)
 
         def read(atom):
-            return self.constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else of_variable[atom]
+            return (
+                self.constant(np.asarray(atom.val, like_of(atom.aval).dtype))
+                if isinstance(atom, Literal)
+                else of_variable[atom]
+            )
 
         for equation in jaxpr.eqns:
             operands = [read(atom) for atom in equation.invars]

@@ -65,7 +65,7 @@ def divided(a: Any, b: Any) -> Any:
 
 
 def remainder(a: Any, b: Any) -> Any:
-    """The remainder of a division of integers that is rounded towards zero; the number itself for a division by zero."""
+    """The remainder of a division that is rounded towards zero; of a division by zero the number itself."""
     by = np.where(b == 0, np.ones_like(b), b)
     return np.where(b == 0, a, np.fmod(a, by)).astype(np.result_type(a, b))[()]
 
@@ -248,12 +248,9 @@ GLOBALS: dict[str, Any] = {
     "cosine": _of_one(math.cos, "cos"),
     "root": _of_one(math.sqrt, "sqrt"),
     "power_of_e": _of_one(math.exp, "exp"),
-    **{
-        function.__name__: function
-        for function in (power, larger, smaller, to_integer, divided, remainder, rounded_away, sign, rank, logistic, full, padded)
-    },
-    **{
-        function.__name__: function
-        for function in (updated, gathered, scattered, ordered, accumulated, factored, solved, rooted)
-    },
 }
+_OWN: list[Callable[..., Any]] = [
+    *(power, larger, smaller, to_integer, divided, remainder, rounded_away, sign, rank, logistic, full, padded),
+    *(updated, gathered, scattered, ordered, accumulated, factored, solved, rooted),
+]
+GLOBALS |= {function.__name__: function for function in _OWN}
