@@ -90,9 +90,12 @@ def setup(
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
     - `compile`: with `"quickly"` programs compile in about six tenths of the time. With `"for speed"` programs of small
         machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
-        are computed side by side, and values of a `jax.vmap`. Results differ in rounding. All three set options of XLA
+        are computed side by side, and values of a `jax.vmap`. Results differ in rounding. These set options of XLA
         for processors in the environment variable `XLA_FLAGS`; options that are set there already stay. With `None`, or
         if JAX has an accelerator, no options are set.
+        With `"later"`, for modelling, no first call waits for the compiler. NumPy computes it, and the compiler works
+        in the background, with the options of `"quickly"`. Digits and numbers of steps change within the tolerance when
+        the program is there, so finite differences, sweeps and tests need another choice.
     - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
         by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS `~/Library/Caches`,
         on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes precedence: another folder, or `off`.

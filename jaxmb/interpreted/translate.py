@@ -220,7 +220,10 @@ class Translator:
         """The value with all its entries in memory."""
         if value.real == value.shape:
             return value
-        text = f"full({value.name}, {value.shape}, {self.type(value.dtype)})"
+        if value.real and math.prod(value.real) == math.prod(value.shape):
+            text = f"{value.name}.reshape({value.shape})"
+        else:
+            text = f"full({value.name}, {value.shape}, {self.type(value.dtype)})"
         return self.put(text, [value], value.shape, value.dtype)
 
     def converted(self, value: Value, dtype: Any) -> Value:

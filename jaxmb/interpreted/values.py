@@ -123,7 +123,7 @@ def _count_of_a_variable() -> int:
 _ALONE = _count_of_a_variable()
 
 
-def _writable(x: Any, count: int) -> Any:
+def _writable(count: int, x: Any) -> Any:
     """The array, or a copy if anything else refers to it."""
     flags = x.flags
     return x if count == _ALONE and flags.owndata and flags.c_contiguous and flags.writeable else x.copy("C")
@@ -131,7 +131,7 @@ def _writable(x: Any, count: int) -> Any:
 
 def updated(x: Any, part: Any, starts: Sequence[Any]) -> Any:
     """The array with a new part that begins at `starts`, or as near as it fits."""
-    x = _writable(x, sys.getrefcount(x))
+    x = _writable(sys.getrefcount(x), x)
     sizes = zip(starts, x.shape, part.shape, strict=True)
     first = [min(max(int(start), 0), whole - size) for start, whole, size in sizes]
     x[tuple(slice(start, start + size) for start, size in zip(first, part.shape, strict=True))] = part
@@ -170,7 +170,7 @@ def gathered(x: Any, places: tuple[Any, Any], fill: Any) -> Any:
 
 def scattered(x: Any, places: tuple[Any, Any], parts: Any, combine: Any, unique: bool) -> Any:
     """The array with entries changed at places in bounds, one after the other."""
-    x, (places, inside) = _writable(x, sys.getrefcount(x)), places
+    x, (places, inside) = _writable(sys.getrefcount(x), x), places
     if inside is not None:
         places, parts = places[inside], parts[inside]
     flat = x.reshape(-1)
