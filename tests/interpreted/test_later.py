@@ -163,7 +163,7 @@ def test_interruptions_end_a_motion_at_once(monkeypatch):
     with pytest.raises(KeyboardInterrupt) as raised:
         swing(t1=10.0)
     motion = raised.value.motion
-    assert motion.stats["interpreted"] and 0 < motion.end.q.size and motion.stats["num_steps"] == 16
+    assert motion.stats["interpreted"] and motion.end.q.size > 0 and motion.stats["num_steps"] == 16
 
 
 def test_motions_go_on_in_the_program_when_it_is_there(compiler, monkeypatch):
