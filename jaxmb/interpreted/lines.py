@@ -140,6 +140,11 @@ class Used:
         return out
 
 
+def of_first(text: str, name: str, other: str) -> str:
+    """A call with another first argument."""
+    return text.replace(f"({name}, ", f"({other}, ", 1)
+
+
 def written(lines: list[Any], said: Any, depth: int = 1) -> list[str]:
     """The text of lines from `Used.of`; `said(about)` becomes a comment, unless it is empty."""
     pad, out = " " * depth, []
@@ -148,7 +153,8 @@ def written(lines: list[Any], said: Any, depth: int = 1) -> list[str]:
             case Let(name=name, text=text, updates=updates, about=about):
                 if more:
                     out += [f"{pad}{name} = {updates}", f"{pad}{updates} = None"]
-                    text = text.replace(f"({updates}, ", f"({name}, ", 1)
+                if updates:
+                    text = of_first(text, updates, name if more else f"{updates}.copy()")
                 told = said(about)
                 out.append(f"{pad}{name} = {text}" + (f"  # {told}" if told else ""))
             case Assign(targets=targets, sources=sources):

@@ -11,7 +11,7 @@ import numpy as np
 from .._compat import Literal, is_of_jax, like_of
 from ..lanes.calls import called
 from . import values
-from .lines import Let, Line
+from .lines import Let, Line, of_first
 
 # The types of numbers that NumPy computes with as XLA does.
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
@@ -123,7 +123,7 @@ class Translator:
         real = shape if real is None else real
         if uses and all(value.constant is not None for value in uses) and math.prod(real or ()) < _MOST:
             with np.errstate(all="ignore"):
-                held = eval(text, self.globals)
+                held = eval(of_first(text, updates, f"{updates}.copy()"), self.globals)
             if real is None:
                 return Value(self.bind(held), None, None, None, 0, held)
             return self.constant(np.asarray(held, dtype))._replace(shape=shape)

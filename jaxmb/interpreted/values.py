@@ -119,14 +119,14 @@ def _count_of_a_variable() -> int:
     return x
 
 
-# The count of references to an array that is only the variable of a caller.
+# The count of references to an array that is only the variable of a caller; a new array has fewer.
 _ALONE = _count_of_a_variable()
 
 
 def _writable(count: int, x: Any) -> Any:
     """The array, or a copy if anything else refers to it."""
     flags = x.flags
-    return x if count == _ALONE and flags.owndata and flags.c_contiguous and flags.writeable else x.copy("C")
+    return x if count <= _ALONE and flags.owndata and flags.c_contiguous and flags.writeable else x.copy("C")
 
 
 def updated(x: Any, part: Any, starts: Sequence[Any]) -> Any:
