@@ -4,6 +4,7 @@ import atexit
 import collections
 import contextlib
 import ctypes
+import functools
 import queue
 import sys
 import threading
@@ -14,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import current_trace, is_weak
+from .._compat import canonical, current_trace, evaluate_calls_by, is_weak
 from .._setup import compiles_later
 from ..linalg.arrays import is_traced
 from .source import Interpreted, interpreted
@@ -37,22 +38,22 @@ class _Program:
     `seconds` of all calls before.
     """
 
-    def __init__(self, traced: Any):
-        self.by_numpy: Interpreted = interpreted(traced.jaxpr)
-        self._traced, self._structure = traced, jax.tree.structure(traced.out_info)
+    def __init__(self, jaxpr: Any, compile: Callable[[], Any]):
+        self.by_numpy: Interpreted = interpreted(jaxpr)
+        self._compile = compile
         self.has, self.began, self.seconds, self._is_wanted = False, None, 0.0, False
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, arrays: list[Any]) -> list[jax.Array]:
         # A script that runs a motion once needs no compiler.
         self._want(self.seconds > 0)
         began = self.began = time.monotonic()
         try:
-            out = self.by_numpy(jax.tree.leaves(arguments[:-1]))
+            out = self.by_numpy(arrays)
         finally:
             _background.busy_at = time.monotonic()
             self.began, self.seconds = None, self.seconds + _background.busy_at - began
         self._want(self.seconds > _REST or hasattr(sys, "ps1") or "ipykernel" in sys.modules)
-        return jax.tree.unflatten(self._structure, jax.device_put(out))
+        return [x if x.dtype == jax.dtypes.float0 else jax.device_put(x) for x in out]
 
     def _want(self, wanted):
         if wanted and not self._is_wanted:
@@ -61,7 +62,7 @@ class _Program:
 
     def compile(self) -> None:
         """Let the compiler make the program, which JAX finds when the function is called."""
-        self._traced.lower().compile()
+        self._compile()
         self.has = True
 
     def waits(self) -> bool:
@@ -117,6 +118,36 @@ class _Background:
 _background = _Background()
 
 
+class _Programs:
+    """The programs of a function, or of several, by keys; None where only the compiler can make one."""
+
+    def __init__(self):
+        self._kept: collections.OrderedDict[Any, _Program | None] = collections.OrderedDict()
+
+    def found(self, key: Any, make: Callable[[], _Program]) -> _Program | None:
+        """The program that NumPy computes, None if the compiler computes it."""
+        if key not in self._kept:
+            try:
+                self._kept[key] = make()
+            except Unsupported:
+                self._kept[key] = None
+            _background.busy_at = time.monotonic()
+            if len(self._kept) > _MOST:
+                self._kept.popitem(last=False)
+        program = self._kept[key]
+        if program is not None and program.has:
+            program = self._kept[key] = None
+        return program
+
+
+def _is_chosen() -> bool:
+    config: Any = jax.config
+    if not compiles_later() or config.jax_disable_jit or config.jax_debug_nans or jax.default_backend() != "cpu":
+        return False
+    _differentiate_by_numpy()
+    return True
+
+
 class Later:
     """A function compiled by `jax.jit`, whose first calls NumPy computes after `jaxmb.setup(compile="later")`.
 
@@ -125,35 +156,48 @@ class Later:
 
     def __init__(self, compiled: Any):
         self.compiled = compiled
-        self._programs: collections.OrderedDict[Any, _Program | None] = collections.OrderedDict()
+        self._programs, self._results = _Programs(), {}
+        _names.add(compiled.__name__)
 
     def __call__(self, *arguments: Any) -> Any:
         return self.way(*arguments)(*arguments)
 
     def way(self, *arguments: Any) -> Callable[..., Any]:
         """The function to call with these arguments: `compiled`, or another that NumPy computes."""
-        if not compiles_later() or current_trace() != _NO_TRACE or is_traced(arguments[:-1]):
-            return self.compiled
-        config: Any = jax.config
-        if config.jax_disable_jit or config.jax_debug_nans or jax.default_backend() != "cpu":
+        if not _is_chosen() or current_trace() != _NO_TRACE or is_traced(arguments[:-1]):
             return self.compiled
         arrays, structure = jax.tree.flatten(arguments[:-1])
-        key = arguments[-1], structure, tuple((np.shape(x), x.dtype) for x in arrays), config.jax_enable_x64
-        if key not in self._programs:
-            self._programs[key] = self._translated(arguments)
-            if len(self._programs) > _MOST:
-                self._programs.popitem(last=False)
-        program = self._programs[key]
-        if program is not None and program.has:
-            program = self._programs[key] = None
-        return self.compiled if program is None else program
+        kinds = tuple((np.shape(x), x.dtype) for x in arrays)
+        key, results = (arguments[-1], structure, kinds, canonical()), self._results
 
-    def _translated(self, arguments):
-        """The program of NumPy; None if only the compiler can make it."""
-        try:
+        def make():
             traced = self.compiled.trace(*arguments)
-            return None if any(map(is_weak, traced.jaxpr.out_avals)) else _Program(traced)
-        except Unsupported:
-            return None
-        finally:
-            _background.busy_at = time.monotonic()
+            if any(map(is_weak, traced.jaxpr.out_avals)):
+                raise Unsupported("results whose type depends on their partners")
+            results[key] = jax.tree.structure(traced.out_info)
+            return _Program(traced.jaxpr, lambda: traced.lower().compile())
+
+        program = self._programs.found(key, make)
+        if program is None:
+            return self.compiled
+        return lambda *arguments: jax.tree.unflatten(results[key], program(jax.tree.leaves(arguments[:-1])))
+
+
+# The names of functions that NumPy may compute, and their programs that JAX calls when it takes derivatives.
+_names: set[str] = set()
+_of_derivatives = _Programs()
+
+
+@functools.cache
+def _differentiate_by_numpy() -> None:
+    """Let NumPy compute the programs that JAX makes of these functions when it takes a derivative outside of `jit`."""
+
+    def evaluated(evaluate: Callable[[], Any], name: str, jaxpr: Any, arrays: list[Any]) -> Any:
+        if name not in _names or not _is_chosen():
+            return evaluate()
+        # Types that depend on their partners, of numbers between two programs, make no difference to the second. A later
+        # call finds the program that `evaluate` has compiled.
+        program = _of_derivatives.found(jaxpr, lambda: _Program(jaxpr, evaluate))
+        return evaluate() if program is None else program(arrays)
+
+    evaluate_calls_by(evaluated)

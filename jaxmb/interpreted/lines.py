@@ -62,6 +62,8 @@ class Used:
 
     def __init__(self, lines: list[Line]):
         self.buffers: set[str] = set()
+        # The names that a loop needs, so far: they become more while the loop around is looked at again.
+        self._needed: dict[int, set[str]] = {}
         while self._spread(lines):
             pass
 
@@ -129,12 +131,14 @@ class Used:
                         out.append((line, inner))
                 case Loop(body=body):
                     after = set(live)
+                    live |= self._needed.get(id(line), set())
                     while True:
                         before = set(live)
                         inner = self.of(body, live, after)
                         live |= before
                         if live == before:
                             break
+                    self._needed[id(line)] = before
                     out.append((line, inner))
         out.reverse()
         return out

@@ -16,6 +16,8 @@ from .lines import Let, Line, of_first
 # The types of numbers that NumPy computes with as XLA does.
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _TYPES = {np.dtype(name) for name in ("bool", "float64", "float32", *_INTEGERS)}
+# The type of tangents of integers, without numbers.
+_NONE = jax.dtypes.float0
 # Constants up to this size are compared by their entries; so many entries at most are computed beforehand.
 _SMALL, _MOST = 4096, 100_000
 
@@ -176,9 +178,12 @@ class Translator:
 
     def _equation(self, equation, operands):
         self._source_info, name = equation.source_info, equation.primitive.name
-        for variable in equation.outvars:
-            if getattr(variable.aval, "dtype", None) not in _TYPES:
-                raise Unsupported(f"{name} with results {variable.aval}")
+        kinds = [variable.aval for variable in equation.outvars]
+        for kind in kinds:
+            if getattr(kind, "dtype", None) not in (*_TYPES, _NONE):
+                raise Unsupported(f"{name} with results {kind}")
+        if all(kind.dtype == _NONE for kind in kinds):
+            return [self.constant(np.zeros(kind.shape, _NONE)) for kind in kinds]
         inner = called(equation)
         if inner is not None:
             return self.program(inner, operands)
@@ -186,8 +191,7 @@ class Translator:
             return self.program(self._written_out(equation), operands)
         found = RULES[name](self, equation, operands)
         found = found if isinstance(found, list) else [found]
-        kinds = [(variable.aval.shape, variable.aval.dtype) for variable in equation.outvars]
-        assert kinds == [(value.shape, value.dtype) for value in found], equation
+        assert [(x.shape, x.dtype) for x in kinds] == [(x.shape, x.dtype) for x in found], equation
         return found
 
     def _written_out(self, equation):
