@@ -206,11 +206,6 @@ def keep_programs_as(store: type[CacheInterface]) -> None:
     compilation_cache.LRUCache = store  # pyright: ignore[reportPrivateImportUsage]
 
 
-def is_weak(aval: Any) -> bool:
-    """The same for the type of a value in a traced program. (jax.core.ShapedArray.weak_type, jax 0.7 to 0.12.)"""
-    return aval.weak_type
-
-
 def is_weakly_typed(array: Array) -> bool:
     """Whether an array takes the type of its partner in an operation, as Python's numbers do.
 

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import canonical, current_trace, evaluate_calls_by, is_weak
+from .._compat import canonical, current_trace, evaluate_calls_by, is_weakly_typed
 from .._setup import compiles_later
 from ..linalg.arrays import is_traced
 from .source import Interpreted, interpreted
@@ -43,7 +43,7 @@ class _Program:
         self._compile = compile
         self.has, self.began, self.seconds, self._is_wanted = False, None, 0.0, False
 
-    def __call__(self, arrays: list[Any]) -> list[jax.Array]:
+    def __call__(self, arrays: list[Any]) -> list[Any]:
         # A script that runs a motion once needs no compiler.
         self._want(self.seconds > 0)
         began = self.began = time.monotonic()
@@ -167,13 +167,11 @@ class Later:
         if not _is_chosen() or current_trace() != _NO_TRACE or is_traced(arguments[:-1]):
             return self.compiled
         arrays, structure = jax.tree.flatten(arguments[:-1])
-        kinds = tuple((np.shape(x), x.dtype) for x in arrays)
+        kinds = tuple((np.shape(x), x.dtype, isinstance(x, jax.Array) and is_weakly_typed(x)) for x in arrays)
         key, results = (arguments[-1], structure, kinds, canonical()), self._results
 
         def make():
             traced = self.compiled.trace(*arguments)
-            if any(map(is_weak, traced.jaxpr.out_avals)):
-                raise Unsupported("results whose type depends on their partners")
             results[key] = jax.tree.structure(traced.out_info)
             return _Program(traced.jaxpr, lambda: traced.lower().compile())
 
@@ -195,8 +193,7 @@ def _differentiate_by_numpy() -> None:
     def evaluated(evaluate: Callable[[], Any], name: str, jaxpr: Any, arrays: list[Any]) -> Any:
         if name not in _names or not _is_chosen():
             return evaluate()
-        # Types that depend on their partners, of numbers between two programs, make no difference to the second. A later
-        # call finds the program that `evaluate` has compiled.
+        # A later call finds the program that `evaluate` has compiled.
         program = _of_derivatives.found(jaxpr, lambda: _Program(jaxpr, evaluate))
         return evaluate() if program is None else program(arrays)
 

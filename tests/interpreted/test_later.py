@@ -188,6 +188,26 @@ def test_motions_go_on_in_the_program_when_it_is_there(compiler, monkeypatch):
     np.testing.assert_allclose(again.ys.q, motion.ys.q, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
+def test_derivatives_are_computed_too(monkeypatch):
+    """In reverse and in forward mode; under `jit` they are compiled."""
+    computed, call = [], later.Interpreted.__call__
+    monkeypatch.setattr(later.Interpreted, "__call__", lambda self, x: computed.append(None) or call(self, x))
+
+    end = lambda x: jnp.sum(mb.simulate(MACHINE.system, mb.State(MACHINE.state.q, x), t1=0.3, rtol=1e-9).ys.q)
+    u = np.asarray(MACHINE.state.u) + 0.1
+    backward, forward = jax.grad(end)(u), jax.jacfwd(end)(u)
+    count = len(computed)
+    assert count >= 3
+    compiled = jax.jit(jax.grad(end))(u)
+    assert len(computed) == count
+    np.testing.assert_allclose(backward, compiled, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(forward, compiled, rtol=1e-6, atol=1e-8)
+    monkeypatch.setattr(later, "compiles_later", lambda: False)
+    np.testing.assert_allclose(jax.grad(end)(u), compiled, rtol=1e-6, atol=1e-8)
+    assert len(computed) == count
+
+
 SCRIPT = """
 import sys, time
 import jaxmb as mb
