@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax._src import compilation_cache, pjit, xla_bridge
+from jax._src.array import ArrayImpl
 from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
 from jax.core import ShapedArray
@@ -193,9 +194,12 @@ def evaluate_calls_by(rule: Callable[[Callable[[], Any], str, Any, list[Any]], A
     """
     call: Any = pjit.jit_p
     plain = call.impl
-    call.def_impl(
-        lambda *arrays, **params: rule(lambda: plain(*arrays, **params), params["name"], params["jaxpr"], list(arrays))
-    )
+
+    @functools.wraps(plain)
+    def evaluated(*arrays, **params):
+        return rule(lambda: plain(*arrays, **params), params["name"], params["jaxpr"], list(arrays))
+
+    call.def_impl(evaluated)
 
 
 def keep_programs_as(store: type[CacheInterface]) -> None:
@@ -204,6 +208,13 @@ def keep_programs_as(store: type[CacheInterface]) -> None:
     (jax._src.compilation_cache.LRUCache, which JAX makes when it first compiles, 0.9 and 0.10.)
     """
     compilation_cache.LRUCache = store  # pyright: ignore[reportPrivateImportUsage]
+
+
+def weakly_typed(array: Array) -> Array:
+    """The array with a weak type. (jax._src.array.ArrayImpl, its buffers and its type, jax 0.9 to 0.12.)"""
+    any_array: Any = array
+    kind, place = any_array.aval.update(weak_type=True), any_array.sharding
+    return ArrayImpl(kind, place, any_array._arrays, committed=any_array._committed, _skip_checks=True)
 
 
 def is_weakly_typed(array: Array) -> bool:

@@ -15,9 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import canonical, current_trace, evaluate_calls_by, is_weakly_typed
+from .._compat import canonical, current_trace, evaluate_calls_by, is_weakly_typed, weakly_typed
 from .._setup import compiles_later
-from ..linalg.arrays import is_traced
+from ..linalg.arrays import derivatives_of, is_traced
 from .source import Interpreted, interpreted
 from .translate import Unsupported
 
@@ -34,13 +34,13 @@ _NO_TRACE = current_trace()
 class _Program:
     """A program that NumPy computes until the compiler has it.
 
-    **Fields:** whether the compiler `has` it; `began`: when a call began that is running, None if none is; the
-    `seconds` of all calls before.
+    **Fields:** the structure of its `results`; whether the compiler `has` it; `began`: when a call began that is
+    running, None if none is; the `seconds` of all calls before.
     """
 
     def __init__(self, jaxpr: Any, compile: Callable[[], Any]):
         self.by_numpy: Interpreted = interpreted(jaxpr)
-        self._compile = compile
+        self._compile, self.results = compile, None
         self.has, self.began, self.seconds, self._is_wanted = False, None, 0.0, False
 
     def __call__(self, arrays: list[Any]) -> list[Any]:
@@ -53,7 +53,7 @@ class _Program:
             _background.busy_at = time.monotonic()
             self.began, self.seconds = None, self.seconds + _background.busy_at - began
         self._want(self.seconds > _REST or hasattr(sys, "ps1") or "ipykernel" in sys.modules)
-        return [x if x.dtype == jax.dtypes.float0 else jax.device_put(x) for x in out]
+        return [_as_jax(x, kind) for x, kind in zip(out, self.by_numpy.given, strict=True)]
 
     def _want(self, wanted):
         if wanted and not self._is_wanted:
@@ -70,6 +70,12 @@ class _Program:
         now, began = time.monotonic(), self.began
         running = 0.0 if began is None else now - began
         return self.seconds + running < _REST and (running > 0 or now - _background.busy_at < _REST)
+
+
+def _as_jax(x, kind):
+    if kind.dtype == jax.dtypes.float0:
+        return x
+    return weakly_typed(jax.device_put(x)) if kind.weak_type else jax.device_put(x)
 
 
 class _End(BaseException):
@@ -155,34 +161,49 @@ class Later:
     """
 
     def __init__(self, compiled: Any):
-        self.compiled = compiled
-        self._programs, self._results = _Programs(), {}
-        _names.add(compiled.__name__)
+        self.compiled, self._programs = compiled, _Programs()
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.way(*arguments)(*arguments)
+        return self.way(*arguments)[0](*arguments)
 
-    def way(self, *arguments: Any) -> Callable[..., Any]:
-        """The function to call with these arguments: `compiled`, or another that NumPy computes."""
-        if not _is_chosen() or current_trace() != _NO_TRACE or is_traced(arguments[:-1]):
-            return self.compiled
+    def way(self, *arguments: Any) -> tuple[Callable[..., Any], bool]:
+        """The function to call with these arguments, and whether NumPy computes it."""
+        if not _is_chosen():
+            return self.compiled, False
+        if is_traced(arguments[:-1]):
+            # Batches, and calls within `jit`, are for the compiler.
+            known = derivatives_of(arguments[:-1]).known
+            (_differentiated.add if known else _differentiated.discard)(self.compiled.__name__)
+            return self.compiled, False
+        if current_trace() != _NO_TRACE:
+            return self.compiled, False
         arrays, structure = jax.tree.flatten(arguments[:-1])
         kinds = tuple((np.shape(x), x.dtype, isinstance(x, jax.Array) and is_weakly_typed(x)) for x in arrays)
-        key, results = (arguments[-1], structure, kinds, canonical()), self._results
-
-        def make():
-            traced = self.compiled.trace(*arguments)
-            results[key] = jax.tree.structure(traced.out_info)
-            return _Program(traced.jaxpr, lambda: traced.lower().compile())
-
-        program = self._programs.found(key, make)
+        key = arguments[-1], structure, kinds, canonical()
+        program = self._programs.found(key, lambda: self._program(arguments))
         if program is None:
-            return self.compiled
-        return lambda *arguments: jax.tree.unflatten(results[key], program(jax.tree.leaves(arguments[:-1])))
+            return self._at_once, False
+        return lambda *arguments: jax.tree.unflatten(program.results, program(jax.tree.leaves(arguments[:-1]))), True
+
+    def _program(self, arguments):
+        traced = self.compiled.trace(*arguments)
+        program = _Program(traced.jaxpr, lambda: traced.lower().compile())
+        program.results = jax.tree.structure(traced.out_info)
+        return program
+
+    def _at_once(self, *arguments):
+        """What the compiler computes, where JAX may evaluate the call itself."""
+        _direct.calls = True
+        try:
+            return self.compiled(*arguments)
+        finally:
+            _direct.calls = False
 
 
-# The names of functions that NumPy may compute, and their programs that JAX calls when it takes derivatives.
-_names: set[str] = set()
+# The names of functions of which derivatives are taken, and the programs that JAX then makes and calls.
+_differentiated: set[str] = set()
+# Whether a function is called by itself, in each thread.
+_direct = threading.local()
 _of_derivatives = _Programs()
 
 
@@ -191,7 +212,7 @@ def _differentiate_by_numpy() -> None:
     """Let NumPy compute the programs that JAX makes of these functions when it takes a derivative outside of `jit`."""
 
     def evaluated(evaluate: Callable[[], Any], name: str, jaxpr: Any, arrays: list[Any]) -> Any:
-        if name not in _names or not _is_chosen():
+        if name not in _differentiated or getattr(_direct, "calls", False) or not _is_chosen():
             return evaluate()
         # A later call finds the program that `evaluate` has compiled.
         program = _of_derivatives.found(jaxpr, lambda: _Program(jaxpr, evaluate))

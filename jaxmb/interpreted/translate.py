@@ -182,7 +182,7 @@ class Translator:
         for kind in kinds:
             if getattr(kind, "dtype", None) not in (*_TYPES, _NONE):
                 raise Unsupported(f"{name} with results {kind}")
-        if all(kind.dtype == _NONE for kind in kinds):
+        if kinds and all(kind.dtype == _NONE for kind in kinds):
             return [self.constant(np.zeros(kind.shape, _NONE)) for kind in kinds]
         inner = called(equation)
         if inner is not None:

@@ -212,11 +212,11 @@ def call(problem: Problem, split: Split, carry: Carry, limit: Any) -> tuple[Traj
     **Arguments:** `split` of the problem; `carry`: what the last call left.
     """
     arguments = split.arrays, carry, limit, split.static
-    way = _called.way(*arguments)
-    if way is not _called.compiled:
+    way, by_numpy = _called.way(*arguments)
+    if by_numpy:
         nothing_compiles()
     motion, outcome, carry = way(*arguments)
-    if way is not _called.compiled:
+    if by_numpy:
         motion["stats"]["interpreted"] = jax.device_put(np.array(True))
     return _trajectory(problem, motion), outcome, carry
 

@@ -96,6 +96,12 @@ def test_calls_that_jax_evaluates(compat, monkeypatch):
     assert {name for name, *_ in seen} == {"<lambda>"} and all(n == m for _, n, m in seen), "jit_p.impl is not called"
 
 
+def test_arrays_of_weak_types(compat):
+    weak = compat.weakly_typed(jnp.arange(3.0))
+    assert compat.is_weakly_typed(weak) and (weak + np.ones(3, np.float32)).dtype == np.float32
+    np.testing.assert_array_equal(weak, [0.0, 1.0, 2.0])
+
+
 def test_whether_jax_has_started(compat):
     jnp.zeros(1)
     assert compat.has_started() is True, "jax._src.xla_bridge no longer tells whether there are backends"
