@@ -210,8 +210,13 @@ def keep_programs_as(store: type[CacheInterface]) -> None:
     compilation_cache.LRUCache = store  # pyright: ignore[reportPrivateImportUsage]
 
 
-def weakly_typed(array: Array) -> Array:
-    """The array with a weak type. (jax._src.array.ArrayImpl, its buffers and its type, jax 0.9 to 0.12.)"""
+def typed_as(aval: Any, array: Array) -> Array:
+    """The array with a weak type if a value in a traced program has one.
+
+    (jax._src.array.ArrayImpl, its buffers and its type, jax 0.9 to 0.12.)
+    """
+    if not aval.weak_type:
+        return array
     any_array: Any = array
     kind, place = any_array.aval.update(weak_type=True), any_array.sharding
     return ArrayImpl(kind, place, any_array._arrays, committed=any_array._committed, _skip_checks=True)

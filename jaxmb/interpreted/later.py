@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._compat import canonical, current_trace, evaluate_calls_by, is_weakly_typed, weakly_typed
+from .._compat import canonical, current_trace, evaluate_calls_by, is_weakly_typed, typed_as
 from .._setup import compiles_later
 from ..linalg.arrays import derivatives_of, is_traced
 from .source import Interpreted, interpreted
@@ -73,9 +73,7 @@ class _Program:
 
 
 def _as_jax(x, kind):
-    if kind.dtype == jax.dtypes.float0:
-        return x
-    return weakly_typed(jax.device_put(x)) if kind.weak_type else jax.device_put(x)
+    return x if kind.dtype == jax.dtypes.float0 else typed_as(kind, jax.device_put(x))
 
 
 class _End(BaseException):

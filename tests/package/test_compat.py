@@ -97,7 +97,10 @@ def test_calls_that_jax_evaluates(compat, monkeypatch):
 
 
 def test_arrays_of_weak_types(compat):
-    weak = compat.weakly_typed(jnp.arange(3.0))
+    (strong, other) = jax.make_jaxpr(lambda x, y: (x, y))(jnp.zeros(2), 1.0).out_avals
+    x = jnp.arange(3.0)
+    assert compat.typed_as(strong, x) is x
+    weak = compat.typed_as(other, x)
     assert compat.is_weakly_typed(weak) and (weak + np.ones(3, np.float32)).dtype == np.float32
     np.testing.assert_array_equal(weak, [0.0, 1.0, 2.0])
 
