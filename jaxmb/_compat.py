@@ -22,12 +22,13 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 import numpy as np
-from jax._src import compilation_cache, xla_bridge
+from jax._src import compilation_cache, pjit, xla_bridge
+from jax._src.array import ArrayImpl
 from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
 from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend import core
+from jax.extend import core, source_info_util
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.interpreters.ad import Zero
@@ -82,6 +83,14 @@ def is_of_jax(primitive: Primitive) -> bool:
     """
     module = getattr(getattr(primitive, "impl", None), "__module__", None) or "jax"
     return module.split(".")[0] in ("jax", "functools")
+
+
+def place_of(source_info: Any) -> str:
+    """Where an equation stands in the code of a user or a package: file, line and function; empty if unknown.
+
+    (jax.extend.source_info_util.summarize, and Equation.source_info, 0.9 to 0.12.)
+    """
+    return "" if source_info is None else source_info_util.summarize(source_info).rpartition("/")[2]
 
 
 def not_inlined() -> Any:
@@ -177,12 +186,40 @@ def _holds(path: Path, text: bytes) -> bool:
         return library.find(text) >= 0
 
 
+def evaluate_calls_by(rule: Callable[[Callable[[], Any], str, Any, list[Any]], Any]) -> None:
+    """Let `rule(evaluate, name, program, arrays)` give the results of calls of compiled functions that JAX evaluates
+    itself, as it does where it takes derivatives of them; `evaluate()` is what JAX does.
+
+    (jax._src.pjit.jit_p and its `impl`, 0.10 to 0.12.)
+    """
+    call: Any = pjit.jit_p
+    plain = call.impl
+
+    @functools.wraps(plain)
+    def evaluated(*arrays, **params):
+        return rule(lambda: plain(*arrays, **params), params["name"], params["jaxpr"], list(arrays))
+
+    call.def_impl(evaluated)
+
+
 def keep_programs_as(store: type[CacheInterface]) -> None:
     """Let JAX use such a store for its folder of compiled programs, as `store(path, max_size=bytes)`.
 
     (jax._src.compilation_cache.LRUCache, which JAX makes when it first compiles, 0.9 and 0.10.)
     """
     compilation_cache.LRUCache = store  # pyright: ignore[reportPrivateImportUsage]
+
+
+def typed_as(aval: Any, array: Array) -> Array:
+    """The array with a weak type if a value in a traced program has one.
+
+    (jax._src.array.ArrayImpl, its buffers and its type, jax 0.9 to 0.12.)
+    """
+    if not aval.weak_type:
+        return array
+    any_array: Any = array
+    kind, place = any_array.aval.update(weak_type=True), any_array.sharding
+    return ArrayImpl(kind, place, any_array._arrays, committed=any_array._committed, _skip_checks=True)
 
 
 def is_weakly_typed(array: Array) -> bool:

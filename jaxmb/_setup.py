@@ -52,7 +52,7 @@ _FOR_BATCHES = _FOR_SPEED | {
     "xla_disable_hlo_passes": f"{_FOR_SPEED['xla_disable_hlo_passes']},cpu-parallel-task-assigner",
     "xla_cpu_prefer_vector_width": "512",
 }
-_OPTIONS = {"quickly": _QUICKLY, "for speed": _FOR_SPEED, "for batches": _FOR_BATCHES, None: {}}
+_OPTIONS = {"quickly": _QUICKLY, "later": _QUICKLY, "for speed": _FOR_SPEED, "for batches": _FOR_BATCHES, None: {}}
 # Python collects garbage when new objects outnumber deleted objects by this. Tracing a program makes a million objects
 # with little garbage, and with the default of 700 the collection takes a sixth of the time.
 _NEW_OBJECTS = 50_000
@@ -70,7 +70,7 @@ SETTINGS = {
 def setup(
     *,
     x64: bool = True,
-    compile: Literal["quickly", "for speed", "for batches"] | None = "quickly",
+    compile: Literal["quickly", "for speed", "for batches", "later"] | None = "quickly",
     keep: bool | str | os.PathLike[str] = True,
     max_bytes: int = MAX_BYTES,
 ) -> None:
@@ -90,9 +90,12 @@ def setup(
     - `x64`: whether JAX computes in double precision; False leaves its precision as it is.
     - `compile`: with `"quickly"` programs compile in about six tenths of the time. With `"for speed"` programs of small
         machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
-        are computed side by side, and values of a `jax.vmap`. Results differ in rounding. All three set options of XLA
+        are computed side by side, and values of a `jax.vmap`. Results differ in rounding. These set options of XLA
         for processors in the environment variable `XLA_FLAGS`; options that are set there already stay. With `None`, or
         if JAX has an accelerator, no options are set.
+        With `"later"`, for modelling, no first call waits for the compiler. NumPy computes it, and the compiler works
+        in the background, with the options of `"quickly"`. Digits and numbers of steps change within the tolerance when
+        the program is there, so finite differences, sweeps and tests need another choice.
     - `keep`: whether compiled programs are kept on disk, for this and later processes; or the folder to keep them in,
         by default `jaxmb` in the user's cache folder: in `$XDG_CACHE_HOME`, in `~/.cache`, on macOS `~/Library/Caches`,
         on Windows `%LOCALAPPDATA%`. The environment variable `JAXMB_CACHE` takes precedence: another folder, or `off`.
@@ -103,11 +106,12 @@ def setup(
     that has computed something already, after which options of XLA have no effect.
     """
     if compile not in _OPTIONS:
-        raise ValueError(f'compile must be "quickly", "for speed", "for batches" or None, got {compile!r}.')
+        raise ValueError(f'compile must be "quickly", "for speed", "for batches", "later" or None, got {compile!r}.')
     if not isinstance(keep, bool | str | os.PathLike):
         raise ValueError(f"keep must be True, False or the folder to keep compiled programs in, got {keep!r}.")
     if not max_bytes > 0:
         raise ValueError(f"max_bytes must be positive, got {max_bytes}.")
+    _later["on"] = compile == "later"
     if x64:
         jax.config.update("jax_enable_x64", True)
     if compile is not None:
@@ -115,6 +119,15 @@ def setup(
     _tell(_OPTIONS[compile] if computes_on_processors() else {})
     if keep is not False:
         _keep_programs(None if keep is True else keep, max_bytes)
+
+
+# Whether the compiler works in the background.
+_later = {"on": False}
+
+
+def compiles_later() -> bool:
+    """Whether NumPy computes programs until the compiler has made them."""
+    return _later["on"]
 
 
 # The options that this module has set in XLA_FLAGS.

@@ -174,6 +174,7 @@ class Trajectory(eqx.Module):
     - `orders`: accepted steps at order 1, 2, ….
     - `linearised_steps`: whether derivatives use one linearisation of the equations at each step, or the derivative of
         each step as it is, which costs more.
+    - `interpreted`: whether NumPy computed any of it, after `setup(compile="later")`.
     - With `solver="auto"` or `"switch"` also `stiff` and `stiff_steps`.
     - With `Hermite`, `num_evaluations` of f with its time derivative, `num_matrices` made, `past_points`: accepted
         steps with 1, 2, … points of the past, and `wrong_derivative`: whether differences of f contradict its

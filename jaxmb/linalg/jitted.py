@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from .._compat import current_trace
+from ..interpreted.later import Later
 from .arrays import ARRAYS, is_traced
 
 _Arguments = ParamSpec("_Arguments")
@@ -61,11 +62,11 @@ def jitted(
 
     # The name in profiles and logs of compilations.
     of_arrays.__name__ = function.__name__.lstrip("_")
-    compiled = jax.jit(of_arrays, static_argnums=1, compiler_options=options)
+    program = Later(jax.jit(of_arrays, static_argnums=1, compiler_options=options))
 
     @functools.wraps(function)
     def called(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> Any:
-        return compiled(*Split.of((arguments, named)))
+        return program(*Split.of((arguments, named)))
 
     return called
 

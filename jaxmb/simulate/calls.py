@@ -135,6 +135,7 @@ def _joined(parts, last):
         return last
     every = [*parts, last]
     along = lambda *x: jax.device_put(np.concatenate(x))
+    by_numpy = jax.device_put(np.any([part.stats["interpreted"] for part in every]))
     ts, ys = along(*(part.ts for part in every)), jax.tree.map(along, *(part.ys for part in every))
     interpolation: Any = last.interpolation
     if interpolation is not None:
@@ -147,4 +148,5 @@ def _joined(parts, last):
             t0_if_trivial=pieces[0].t0_if_trivial,
             y0_if_trivial=pieces[0].y0_if_trivial,
         )
-    return changed(last, ts=ts, ys=ys, interpolation=interpolation)
+    stats = last.stats | {"interpreted": by_numpy}
+    return changed(last, ts=ts, ys=ys, interpolation=interpolation, stats=stats)

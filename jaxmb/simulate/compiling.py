@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 
+from .._setup import compiles_later
 from ..system import AbstractSystem
 
 # The time [s] after which a user is told.
@@ -48,7 +49,9 @@ class _Wait:
         if self.told:
             now = time.monotonic()
             ended = now if self.ended is None else self.ended
-            print(f" {ended - self.began:.1f} s; a later call takes {_in_words(now - ended)}", file=sys.stderr)
+            way = "" if compiles_later() else '; setup(compile="later") does not wait'
+            took = f"{ended - self.began:.1f} s; a later call takes {_in_words(now - ended)}"
+            print(f" {took}{way}", file=sys.stderr)
 
 
 # The wait of each thread.
@@ -78,6 +81,13 @@ def tracing_begins() -> None:
     wait = getattr(_waiting, "now", None)
     if wait is not None and not wait.began:
         wait.begin()
+
+
+def nothing_compiles() -> None:
+    """To be called where NumPy computes what was traced."""
+    wait = getattr(_waiting, "now", None)
+    if wait is not None and wait.ended is None:
+        wait.ended = time.monotonic()
 
 
 @functools.cache

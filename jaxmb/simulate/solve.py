@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
@@ -15,6 +16,7 @@ from .._results import RESULTS
 from .._types import State
 from ..contacts.events import FoundEvents
 from ..contacts.guards import contact_guards
+from ..interpreted.later import Later
 from ..linalg.failure import nan_where
 from ..linalg.jitted import Split, jitted, shapes_of
 from ..manifold.diagnosis import diagnose_friction
@@ -30,7 +32,7 @@ from ..system import AbstractSystem
 from ..system.inputs import inputs_ended
 from ..system.instant import Instant
 from ..trajectory import Trajectory
-from .compiling import tracing_begins
+from .compiling import nothing_compiles, tracing_begins
 from .integrate import integrated
 from .method import Method
 from .outcome import Flags, Outcome, first_of, has_failed
@@ -209,7 +211,13 @@ def call(problem: Problem, split: Split, carry: Carry, limit: Any) -> tuple[Traj
 
     **Arguments:** `split` of the problem; `carry`: what the last call left.
     """
-    motion, outcome, carry = _called(split.arrays, carry, limit, split.static)
+    arguments = split.arrays, carry, limit, split.static
+    way, by_numpy = _called.way(*arguments)
+    if by_numpy:
+        nothing_compiles()
+    motion, outcome, carry = way(*arguments)
+    if by_numpy:
+        motion["stats"]["interpreted"] = jax.device_put(np.array(True))
     return _trajectory(problem, motion), outcome, carry
 
 
@@ -223,6 +231,7 @@ def _traced(problem: Problem):
     return _solved(problem)
 
 
+@Later
 @functools.partial(jax.jit, static_argnums=3)
 def _called(arrays, carry, limit, static):
     problem: Problem = Split(arrays, static).whole()
@@ -344,7 +353,7 @@ def _statistics(problem, solver, solution, end):
     if isinstance(solver, AbstractMultistep):
         stats |= solver.statistics(solution.solver_state, solution.controller_state, stats)
         linearised = solver.linear_steps(False) is not None
-    stats |= {"linearised_steps": jnp.array(linearised)}
+    stats |= {"linearised_steps": jnp.array(linearised), "interpreted": jnp.array(False)}
     stats |= problem.method.policy.statistics(solution.solver_state)
     if end.events is not None:
         stats |= {"num_events": jnp.minimum(end.events.number, problem.stops.max_events)}

@@ -18,6 +18,7 @@ from jax import lax
 
 from jaxmb._branches import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from jaxmb._compat import while_loop
+from jaxmb.interpreted import Unsupported, interpreted
 from jaxmb.lanes import in_lanes
 
 # The sizes of axes; some are the numbers of members as well.
@@ -500,5 +501,20 @@ def results(seed: int, count: int = 4) -> Iterator[tuple[Any, Any]]:
 @pytest.mark.parametrize("seed", range(12))
 def test_random_programs_have_the_results_of_a_loop(seed):
     for k, (expected, found) in enumerate(results(seed)):
+        assert (found.shape, found.dtype) == (expected.shape, expected.dtype), (seed, k, found.shape, expected.shape)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=f"program {seed}, result {k}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 112))
+def test_random_programs_have_the_results_of_numpy(seed):
+    given, varies = arguments(seed)
+    example = [x[0] if v else x for x, v in zip(given, varies, strict=True)]
+    traced = jax.jit(functools.partial(program, seed, 6, DEPTH, ALL if seed % 2 else NONE)).trace(*example)
+    try:
+        by_numpy = interpreted(traced.jaxpr)
+    except Unsupported as error:
+        pytest.skip(f"only the compiler knows {error}")
+    for k, (found, expected) in enumerate(zip(by_numpy(example), traced.lower().compile()(*example), strict=True)):
         assert (found.shape, found.dtype) == (expected.shape, expected.dtype), (seed, k, found.shape, expected.shape)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=f"program {seed}, result {k}")

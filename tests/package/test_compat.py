@@ -74,6 +74,37 @@ def test_weak_types(compat):
     assert (strong.shape, strong.weak_type, weak.shape, weak.weak_type) == ((2,), False, (), True), about
 
 
+def test_places_of_equations(compat):
+    (equation,) = jax.make_jaxpr(lambda x: lax.sin(x))(1.0).eqns
+    place = compat.place_of(equation.source_info)
+    assert place.startswith("test_compat.py:") and "test_places_of_equations" in place, place
+    assert compat.place_of(None) == ""
+
+
+def test_calls_that_jax_evaluates(compat, monkeypatch):
+    """Under a derivative, of a compiled function: its value and its tangent."""
+    call, seen = compat.pjit.jit_p, []
+    monkeypatch.setattr(call, "impl", call.impl)
+
+    def rule(evaluate, name, program, arrays):
+        seen.append((name, len(program.in_avals), len(arrays)))
+        return [np.asarray(x) for x in evaluate()]
+
+    compat.evaluate_calls_by(rule)
+    named = jax.jit(lambda x: jnp.sin(x) * x)
+    assert float(jax.grad(named)(0.5)) == pytest.approx(np.cos(0.5) * 0.5 + np.sin(0.5))
+    assert {name for name, *_ in seen} == {"<lambda>"} and all(n == m for _, n, m in seen), "jit_p.impl is not called"
+
+
+def test_arrays_of_weak_types(compat):
+    (strong, other) = jax.make_jaxpr(lambda x, y: (x, y))(jnp.zeros(2), 1.0).out_avals
+    x = jnp.arange(3.0)
+    assert compat.typed_as(strong, x) is x
+    weak = compat.typed_as(other, x)
+    assert compat.is_weakly_typed(weak) and (weak + np.ones(3, np.float32)).dtype == np.float32
+    np.testing.assert_array_equal(weak, [0.0, 1.0, 2.0])
+
+
 def test_whether_jax_has_started(compat):
     jnp.zeros(1)
     assert compat.has_started() is True, "jax._src.xla_bridge no longer tells whether there are backends"

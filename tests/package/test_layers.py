@@ -31,7 +31,7 @@ LAYERS = [
         "_results",
         "_version",
     ],
-    ["_branches", "linalg", "lanes"],
+    ["_branches", "linalg", "lanes", "interpreted"],
     ["_arguments"],
     ["solvers"],
     ["_captured", "_dataflow", "_index_bounds", "_jaxpr_digest", "_traced_functions"],
