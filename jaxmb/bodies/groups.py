@@ -749,7 +749,7 @@ class NonIdealGroup(AbstractGroup):
         """Vectors as long as the normal forces of dry friction are large, for each row of the laws."""
         part, d = self.group.part, self._space.dimension
         if self.needs == "nothing":
-            return jnp.eye(1, d, dtype=now.poses.dtype).repeat(len(self.group.names), axis=0)
+            return jnp.zeros((len(self.group.names), d), now.poses.dtype)
         if self.needs == "wrenches":
             forces = reactions[:, part.last, :d]
             return forces if part.rows == 1 else jnp.repeat(forces, part.rows, axis=0)

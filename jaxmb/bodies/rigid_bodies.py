@@ -19,7 +19,7 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import DenseJacobian
 from ..parts.base import AbstractLink
 from ..solvers.manifold_term import GapsSeen
-from ..system.contact_set import ContactNumbers, ContactSet
+from ..system.contact_set import ContactLaws, ContactSet, LawTable
 from ..system.design_variables import DesignVariables
 from ..system.equation import Ranks
 from ..system.system import AbstractSystem, GivenInTime
@@ -330,16 +330,10 @@ class RigidBodySystem(AbstractSystem):
 
     # Contacts and dry friction
 
-    def contact_numbers(self, t):
-        contacts = [g.group.at(t) for g in self.constraints.contacts]
-        frictions = [(g.group.at(t), g.rows) for g in self.constraints.frictions]
-        joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
-        return ContactNumbers(
-            restitution=joined(part.restitution for part in contacts),
-            peaks=joined(part.peak for part in contacts),
-            coefficient=joined(_of_rows(part.coefficient, rows) for part, rows in frictions),
-            limit=joined(_of_rows(part.limit, rows) for part, rows in frictions),
-        )
+    def contact_laws(self, t):
+        contacts, frictions, dtype = self.constraints.contacts, self.constraints.frictions, self.length.dtype
+        normal, slip = (LawTable.of((g.laws(t) for g in groups), dtype) for groups in (contacts, frictions))
+        return ContactLaws(normal, slip, joined([g.group.at(t).peak for g in contacts], dtype))
 
     @property
     def has_gaps(self):
@@ -473,10 +467,3 @@ class RigidBodySystem(AbstractSystem):
         sets = *(f"constraints.{kind}" for kind in ("position", "velocity", "servos", "nonideal")), "forces.groups"
         places = [(path, k) for path in sets for k, g in enumerate(attrgetter(path)(self)) if g.group.of_time]
         return [lambda system, path=path, k=k: attrgetter(path)(system)[k] for path, k in places]
-
-
-def _of_rows(values: Array, count: int) -> Array:
-    """Values of parts, repeated for each of their rows; those of rows in order."""
-    if values.ndim == 2:
-        return values.reshape(-1)
-    return values if count == 1 else jnp.repeat(values, count, axis=0)

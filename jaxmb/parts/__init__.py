@@ -59,6 +59,7 @@ from .unilateral import (
     AbstractGeometricContact as AbstractGeometricContact,
     AbstractSurfaceContact as AbstractSurfaceContact,
 )
+from .contact_laws import AbstractImpactLaw as AbstractImpactLaw, AbstractSlipLaw as AbstractSlipLaw
 from .contact import AbstractNormalLaw as AbstractNormalLaw, AbstractFrictionLaw as AbstractFrictionLaw
 from .terrain import AbstractTerrain as AbstractTerrain
 

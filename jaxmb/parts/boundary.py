@@ -28,6 +28,7 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
+from .contact_laws import AbstractImpactLaw, AbstractSlipLaw
 from .dry_friction import AbstractStickSlip
 from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
@@ -62,8 +63,23 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
         if rows != part.rows:
             raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
     _check_declared(part, space, bodies)
+    if isinstance(part, AbstractStickSlip | AbstractUnilateralConstraint) and is_of_user(part):
+        _check_contact_law(part)
     if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):
         raise ValueError(f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce.")
+
+
+def _check_contact_law(part: Any) -> None:
+    """Refuse a contact law of a user's class that is none, or that does not return numbers."""
+    law, kind = part.contact_law, AbstractSlipLaw if isinstance(part, AbstractStickSlip) else AbstractImpactLaw
+    if not isinstance(law, kind):
+        raise ValueError(f"{part.label}: contact_law must be a parts.{kind.__name__}, got {type(law).__name__}.")
+    if isinstance(law, AbstractSlipLaw) and law.resists and part.needs == "normal":
+        raise ValueError(f"{part.label}: a contact has no friction without a normal force; leave out resists=True.")
+    one = np.ones((), np.dtype(jnp.result_type(float)))
+    for name, count in law.asked.items():
+        answer = lambda *numbers, name=name, count=count: getattr(law, name)(*numbers[:count])
+        check_returns(part.label, f"contact_law.{name}", (), answer, *[one] * max(count, 1))
 
 
 def _check_declared(part: Any, space: AbstractSpace, bodies: int) -> None:
@@ -128,6 +144,11 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         zeta = np.zeros(len(part.modes), np.dtype(jnp.result_type(float)))
         for name, given in (("mass_matrix", [zeta]), ("energy", [zeta]), ("internal_force", [zeta, zeta])):
             yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
+    if isinstance(part, AbstractStickSlip | AbstractUnilateralConstraint):
+        one = np.ones((), np.dtype(jnp.result_type(float)))
+        for name, count in getattr(part.contact_law, "asked", {}).items():
+            ask = lambda part, *numbers, name=name: getattr(part.contact_law, name)(*numbers)
+            yield name, (ask, [one] * count)
     for name, _, given in _kernels(part, space, bodies):
         yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):

@@ -24,7 +24,7 @@ from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..solvers.manifold_term import AbstractFieldJacobian, GapsSeen
-from .contact_set import ContactNumbers, ContactSet
+from .contact_set import ContactLaws, ContactSet, LawTable
 from .velocity_facts import VelocityFact, is_drift_free, is_linear
 
 if TYPE_CHECKING:
@@ -282,10 +282,11 @@ class AbstractEquation(eqx.Module):
 
     # Unilateral constraints
 
-    def contact_numbers(self, t: Scalar) -> ContactNumbers:
-        """The numbers of `contacts` at a time; they are parameters, and some may be inputs."""
+    def contact_laws(self, t: Scalar) -> ContactLaws:
+        """The laws of `contacts` at a time; their numbers are parameters, and some may be inputs."""
         del t
-        return ContactNumbers(*[jnp.zeros(0)] * 4)
+        none = LawTable((), (), jnp.zeros(0))
+        return ContactLaws(none, none, none.none)
 
     # Implicit methods
 

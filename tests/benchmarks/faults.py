@@ -665,8 +665,8 @@ FAULTS = [
     Fault("contacts/events.py", "Event(time + float(rest), name", "Event(time - float(rest), name"),
     Fault(
         "contacts/forces.py",
-        "limit = at.system.contact_numbers(at.t).limit",
-        "limit = at.system.contact_numbers(at.t).coefficient",
+        "coefficient, hold = sticking(at)",
+        "coefficient, hold = slowly_sliding(at)",
     ),
     Fault(
         "contacts/friction.py",
@@ -694,14 +694,14 @@ FAULTS = [
     Fault("contacts/impact.py", "dq + dlate * rates[0], du + dlate", "dq - dlate * rates[0], du + dlate"),
     Fault(
         "contacts/impacting.py",
-        "restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)",
-        "restitution * jnp.abs(when.at[: self.contacts.n])",
+        "jnp.maximum(-when.at[: self.contacts.n], 0.0)",
+        "jnp.abs(when.at[: self.contacts.n])",
     ),
     Fault("contacts/impacting.py", "closing**2 - 2 * curve[:n] * gap", "closing**2 + 2 * curve[:n] * gap"),
     Fault(
-        "contacts/impacting.py",
-        "again = self.system.contact_numbers(self.at.t).restitution * impulses[: self.contacts.n]",
-        "again = self.system.contact_numbers(self.at.t).restitution**2 * impulses[: self.contacts.n]",
+        "parts/contact_laws.py",
+        "return self.restitution * impulse",
+        "return self.restitution**2 * impulse",
     ),
     Fault("contacts/impacting.py", "2 * rate / (falls * (1 - ratio))", "2 * rate / falls"),
     Fault(
@@ -711,8 +711,8 @@ FAULTS = [
     ),
     Fault(
         "contacts/phases.py",
-        "bounce = frame.here.restitution * jnp.maximum(-rates[: contacts.n], 0.0)",
-        "bounce = jnp.maximum(-rates[: contacts.n], 0.0)",
+        'frame.here.laws.ask("rebound", closing)',
+        "closing",
     ),
     # Formulations
     Fault("formulations/friction.py", "return jnp.all((y > 0) & jnp.isfinite(y))", "return jnp.all(jnp.isfinite(y))"),
