@@ -38,8 +38,6 @@ def contact_set(
         releases=tuple(g.group.part.contact_law.jumps for g in frictions for _ in range(_count(g))),
         pairs=tuple(pairs),
         of_reactions=any(g.law.needs in ("wrenches", "multipliers") for g in frictions),
-        varies=any(g.group.part.contact_law.varies for g in frictions),
-        resists=any(g.group.part.contact_law.resists for g in frictions),
         coupled=any(g.group.part.coupled for g in frictions),
         sharing=Sharing() if shares else NoSharing(),
     )

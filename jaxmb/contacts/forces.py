@@ -61,13 +61,13 @@ class Limits(NamedTuple):
 def sticking(at: Instant) -> Limits:
     """The limits of stick."""
     laws = at.contact_laws.slip
-    return Limits(laws.ask("limit"), laws.ask("hold") if at.system.contacts.resists else None)
+    return Limits(laws.ask("limit"), laws.ask("hold") if laws.resists else None)
 
 
 def sliding(at: Instant, speeds: Float[Array, "frictions"]) -> Limits:
     """The forces of slip at some speeds."""
     laws = at.contact_laws.slip
-    force = laws.ask("resistance", speeds) if at.system.contacts.resists else None
+    force = laws.ask("resistance", speeds) if laws.resists else None
     return Limits(laws.ask("coefficient", speeds), force)
 
 

@@ -75,7 +75,7 @@ class Laws(NamedTuple):
 
     def sliding(self, speeds: Any) -> Limits:
         """The forces of slip at some speeds, as multiples of the forces along the gaps."""
-        return sliding(self.at, speeds).along_gaps(self.at) if self.contacts.varies else self.slow
+        return sliding(self.at, speeds).along_gaps(self.at) if self.at.contact_laws.slip.varies else self.slow
 
     def sizes(self, values):
         """The sizes of friction values: of one direction, or of both directions together."""
@@ -90,7 +90,7 @@ class Laws(NamedTuple):
         """
         reactions = jax.tree.map(jnp.zeros_like, reactions)
         none, may = jnp.zeros(self.contacts.m, approach.dtype), self.may(touching) & ~self.contacts.in_joints
-        among, speeds = jnp.concatenate([touching, may]), none if self.contacts.varies else None
+        among, speeds = jnp.concatenate([touching, may]), none if self.at.contact_laws.slip.varies else None
         return Problem(approach, among, self.slow.coefficient, none, none, speeds, reactions)
 
     def of_expansion(self, free, again, touching, reactions) -> Problem:
@@ -111,7 +111,7 @@ class Laws(NamedTuple):
         """
         # Friction that has just reached its limit is beyond it, up to the resolution of the search for laws.
         near, may_stick = jnp.where(modes.sticks, 1 - _REACHED, 1 + _HELD), self.sizes(slips) == 0
-        speeds = jnp.where(may_stick, 0.0, self.sizes(rates)) if self.contacts.varies else None
+        speeds = jnp.where(may_stick, 0.0, self.sizes(rates)) if self.at.contact_laws.slip.varies else None
         limit = lambda stick, slip: jnp.where(may_stick, stick * near, slip)
         coefficient, bounds = jax.tree.map(limit, self.sticking, self.sliding(speeds))
         if reactions is not None:

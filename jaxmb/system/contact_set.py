@@ -32,6 +32,11 @@ class StackedLaws(eqx.Module):
     def count(self) -> int:
         return len(jax.tree.leaves(self.laws)[0])
 
+    @property
+    def kind(self) -> Any:
+        """A law, for what it says of its class."""
+        return self.laws.contact_law if self.kernels else self.laws
+
     def ask(self, name: str, *values: Float[Array, "laws"]) -> Float[Array, "laws"]:
         """The answers of a method."""
         method = dict(self.kernels).get(name, lambda law, *values: getattr(law, name)(*values))
@@ -62,6 +67,16 @@ class LawTable(eqx.Module):
         members = [tuple(k for _, of_group in alike for k in of_group) for alike in kinds.values()]
         return cls(tuple(stacked), tuple(members), jnp.zeros(0, dtype))
 
+    @property
+    def varies(self) -> bool:
+        """Whether some friction depends on the speed of slip."""
+        return any(stacked.kind.varies for stacked in self.kinds)
+
+    @property
+    def resists(self) -> bool:
+        """Whether some friction has a force without a normal force."""
+        return any(stacked.kind.resists for stacked in self.kinds)
+
     def ask(self, name: str, *values: Float[Array, "laws"]) -> Float[Array, "laws"]:
         """The answers of a method of the laws, whose arguments have one value for each law."""
         if len(self.kinds) < 2:
@@ -81,10 +96,6 @@ class ContactLaws(NamedTuple):
     normal: LawTable
     slip: LawTable
     peaks: Float[Array, "contacts"]
-
-    def held(self) -> Float[Array, "frictions"]:
-        """The largest forces of stick without a normal force."""
-        return self.slip.ask("hold")
 
 
 class ContactPlace(NamedTuple):
@@ -128,8 +139,7 @@ class ContactSet:
     - For each contact: the number of the `phases` of its impacts.
     - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; in `releases`, whether
         accelerations jump as slip begins.
-    - `of_reactions`: whether some friction depends on the reaction of a joint; `varies`: whether some depends on the
-        speed of slip; `resists`: whether some has a force without a normal force.
+    - `of_reactions`: whether some friction depends on the reaction of a joint.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
     - `sharing`: what is added if contacts imply each other when all are closed, see `shared_contacts`.
@@ -142,8 +152,6 @@ class ContactSet:
     contact_of: tuple[int, ...] = ()
     releases: tuple[bool, ...] = ()
     of_reactions: bool = False
-    varies: bool = False
-    resists: bool = False
     pairs: tuple[int, ...] = ()
     coupled: bool = False
     sharing: NoSharing = dataclasses.field(default_factory=NoSharing)

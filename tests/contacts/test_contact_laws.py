@@ -10,6 +10,8 @@ import pytest
 import jaxmb as mb
 from jaxmb import parts, planar
 
+MOST_PROGRAMS = 70
+
 G, HEIGHT = 9.81, 1.0
 GRAVITY = mb.Gravity((0.0, -G))
 
@@ -100,12 +102,18 @@ def test_friction_that_depends_on_the_speed():
     floor = mb.RigidContact("floor", "body", terrain=mb.terrain.Flat())
     rub = OilyFriction("rub", "floor", coefficient=mu, viscous=c)
     system = mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
-    motion = mb.simulate(system, mb.assemble(system, fix={"floor.mode": 1}), t1=1.0)
+
+    @jax.jit
+    def run(state):
+        motion = mb.simulate(system, state, t1=1.0, max_events=2)
+        return motion.events.times, motion["body"].position[-1, 0]
+
+    closed = system.contacts.with_modes(system.guess.q, np.array([1.0, 0.0]))
+    times, x = run(mb.State(closed, system.guess.u))
     stop = np.log(1 + c * start / mu) / (c * G)
-    np.testing.assert_allclose(motion.events.times, [stop], rtol=1e-8)
+    np.testing.assert_allclose(times, [stop, np.inf], rtol=1e-8)
     way = (start + mu / c) * (1 - np.exp(-c * G * stop)) / (c * G) - mu / c * stop
-    np.testing.assert_allclose(motion["body"].position[-1, 0], way, rtol=1e-8)
-    assert [event.kind for event in motion.events] == ["stick"]
+    np.testing.assert_allclose(x, way, rtol=1e-8)
 
 
 class NoLaw(SoftContact):

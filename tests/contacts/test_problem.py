@@ -25,7 +25,8 @@ def found():
     def answers(mode, load):
         one, none = jnp.ones(1), jnp.zeros(0)
         joint = ContactSet(names=("rub",), rows=(0,), places=(0,), contact_of=(-1,), releases=(False,))
-        at: Any = types.SimpleNamespace(system=types.SimpleNamespace(contacts=joint))
+        constant = types.SimpleNamespace(slip=types.SimpleNamespace(varies=False))
+        at: Any = types.SimpleNamespace(system=types.SimpleNamespace(contacts=joint), contact_laws=constant)
         limits = Limits(COEFFICIENT * one, None)
         laws = Laws(at, jnp.eye(1), limits, limits)
         reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
