@@ -4,6 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import equinox as eqx
@@ -303,6 +304,10 @@ class AbstractGroup(eqx.Module):
             return self._map(lambda at, x: kernel(at(now.t), at(now.t).seen_poses(self._space, x), now.t), now.poses)
         return self._of_motion(name, now)
 
+    def state_rates(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
+        """Rates of the parts' internal states, by the name of the field."""
+        return self._of_motion("state_rates", now)
+
     @staticmethod
     def _raveled(of_parts):
         leaves = jax.tree.leaves(of_parts)
@@ -345,6 +350,10 @@ class BodyGroup(AbstractGroup):
     def inertia(self) -> Float[Array, "parts *matrix"]:
         """Moments of inertia [kg m²] about the mass centres."""
         return jax.vmap(self.group.kernel("inertia"))(self.group.part)
+
+    def state_rates(self, now):
+        kernel = self.group.kernel("state_rates")
+        return self._map(lambda at, x, v: kernel(at(now.t), x, v, now.t), now.poses, now.velocities)
 
 
 class FlexibleGroup(BodyGroup):
@@ -693,10 +702,6 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
-    def state_rates(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
-        """Rates of the parts' internal states, by the name of the field."""
-        return self._of_motion("state_rates", now)
-
     def derivatives(self, now: Kinematics) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
         """Derivatives of `wrenches` by displacements along the velocities of the parts' bodies, and by velocities."""
 
@@ -777,6 +782,17 @@ class NonIdealGroup(AbstractGroup):
             return part.wrenches_on_bodies(space, x, kernel(part, *seen, now.t))
 
         return self._map(single, now.poses, now.velocities, per_part=(reactions,))
+
+
+# Paths to the groups of a system, by the sets that they belong to.
+BIND_POSITIONS = "constraints.position"
+BIND = (BIND_POSITIONS, "constraints.velocity", "constraints.servos")
+_OTHERS = ("forces.groups", "constraints.nonideal", "frames", "bodies.tendons", "free_joints")
+
+
+def groups_by_path(system: Any) -> dict[str, tuple[Any, ...]]:
+    """All groups of a system's parts, by the path of their set."""
+    return {path: attrgetter(path)(system) for path in ("bodies.groups", *BIND, *_OTHERS)}
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:

@@ -37,6 +37,7 @@ from .joint_graph import extended_joint_order
 from .layout import Layout
 from .motion import coordinate_names, rate_names
 from .parameters import SceneParameters
+from .state_table import StateTable
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities: 0.5 ms in blocks, 6.4 ms with dense matrices. Dense matrices of small machines with joints are cheap.)
@@ -238,19 +239,24 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def state_ends(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return tuple(state.stop for state in self.forces.states)
+        return tuple(state.stop for state in self.state_table.fields)
+
+    @property
+    def state_table(self) -> StateTable:
+        """The internal states of the parts."""
+        return StateTable(self)
 
     def state_names(self):
-        return self.forces.state_names()
+        return self.state_table.names()
 
     def with_states(self, z):
-        return dataclasses.replace(self, forces=self.forces.with_states(z))
+        return self.state_table.held(z)
 
     def state_rates(self, t, q, u):
-        return self.forces.state_rates(self.kinematics(t, q, u))
+        return self.state_table.rates(self.kinematics(t, q, u))
 
     def state_scale(self):
-        return lax.stop_gradient(self.forces.state_scale(self.length.dtype))
+        return lax.stop_gradient(self.state_table.scale(self.length.dtype))
 
     # Constraints
 
@@ -372,7 +378,7 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared(self):
         mass = self.mass_matrix
-        if mass is None and not self.layout.flexible:
+        if mass is None and self.bodies.constant_inertia:
             mass = self.bodies.inertia(self.guess.q, self.constraints.scalar_inertias)
             mass = mass.with_inverse(self.guess.u) if self.spatial and self.acceleration_rows else mass
         constraints, bodies = self.constraints.prepared(), self.bodies.prepared()

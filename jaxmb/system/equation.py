@@ -157,8 +157,8 @@ class AbstractEquation(eqx.Module):
     def force(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
         """`F(t, q, u)`: applied forces and the bias of inertia."""
 
-    # Internal states z with ż = h(t, q, u, z). Forces depend on z, constraints do not. So the equations above hold as
-    # they are for a system that holds values of its states.
+    # Internal states z with ż = h(t, q, u, z). Forces, laws of contacts and inertia may depend on z, constraints do
+    # not. So the equations above hold as they are for a system that holds values of its states.
 
     @property
     def nz(self) -> int:
@@ -166,7 +166,7 @@ class AbstractEquation(eqx.Module):
         return 0
 
     def with_states(self, z: Float[Array, "nz"]) -> Self:
-        """The same system with values of its internal states, for its forces and `state_rates`."""
+        """The same system with values of its internal states."""
         del z
         return self
 
