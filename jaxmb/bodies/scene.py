@@ -246,7 +246,11 @@ def as_given(scene: Scene) -> RigidBodySystem:
         implied=(),
         elimination=None,
     )
-    system = _with_initial_scalars(system)
+    return _with_initial_states(_with_initial_scalars(system))
+
+
+def _with_initial_states(system: RigidBodySystem) -> RigidBodySystem:
+    """The system with the parts' internal states in its guess, and none in the parts."""
     guess = dataclasses.replace(system.guess, z=system.state_table.initial())
     return dataclasses.replace(system.state_table.held(None), guess=guess)
 

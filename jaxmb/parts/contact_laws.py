@@ -71,7 +71,20 @@ class AbstractImpactLaw(AbstractContactLaw):
 
 
 class Newton(AbstractImpactLaw):
-    """Newton's law of impact: the gap opens at `restitution` times the rate at which it closed."""
+    """Newton's law of impact: the gap opens at `restitution` times the rate at which it closed.
+
+    ```python
+    class WornContact(jaxmb.RigidContact):
+        wear: jaxmb.parts.Number = jaxmb.parts.parameter(unit="1", default=0.0)
+
+        @property
+        def contact_law(self):
+            kind = jaxmb.parts.Poisson if self.impact_law == "poisson" else jaxmb.parts.Newton
+            return kind(self.restitution * (1 - self.wear))
+
+    floor = WornContact("floor", "bar", terrain=jaxmb.terrain.Flat(-2.0), restitution=0.8, wear=0.2)
+    ```
+    """
 
     restitution: Float[Array, "*contacts"]
 
