@@ -164,7 +164,7 @@ SLIDER = {"mass": 1.5, "inertia": 0.1, "bob": 0.5, "stiffness": 40.0}
 BAD = {
     "rows": (
         lambda: mb.Scene([planar.PointMass("body", mass=1.0)], joints=[Lagging("lift", "body")]),
-        "residual must not",
+        "Lagging 'lift': its residual must not depend on its internal states",
     ),
     "no rates": (lambda: mb.Scene([NoRates("box", **SLIDER)]), "derive it from AbstractDynamicPart"),
     "other rates": (
