@@ -21,7 +21,6 @@ from ..linalg.rotations import cross
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.boundary import captured
-from ..parts.dry_friction import AbstractStickSlip
 from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
@@ -743,8 +742,7 @@ class NonIdealGroup(AbstractGroup):
     @property
     def needs(self) -> str:
         """What the laws need of their joints: reaction `"wrenches"`, `"multipliers"` in their place, or `"nothing"`."""
-        part = self.group.part
-        return part.needs if isinstance(part, AbstractStickSlip) else "wrenches"
+        return self.group.part.needs
 
     def tensions(self, now: Kinematics, reactions: Float[Array, "parts rows"]) -> Float[Array, "parts spans"]:
         """Tensions of the spans of ropes."""

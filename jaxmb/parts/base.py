@@ -874,6 +874,8 @@ class AbstractNonIdeal(AbstractActor):
 
     joint: AbstractVar[str]
     stage: ClassVar[int] = 2
+    # As for `AbstractStickSlip`.
+    needs: ClassVar[str] = "wrenches"
 
     @property
     def sources(self):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from .linear_map import filled
+from ..linalg.pushed import filled
 
 
 class Layout:
