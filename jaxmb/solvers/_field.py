@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..linalg.pushed import filled
+from .linear_map import filled
 
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]

@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._branches import cond_of_any_lane
-from ..linalg.pushed import filled
 from ._field import Derivatives, Field, Solution, derivatives, linearized
+from .linear_map import filled
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._compat import Primitive, ShapedArray, Zero, ad, batching, let_go, mlir
-from ..linalg.pushed import filled
 
 _SECOND_REVERSE = (
     "A derivative of a motion is differentiated in forward mode only: take jax.hessian, or jax.jacfwd of jax.grad, "
@@ -128,6 +127,12 @@ def linear_map(
     programs = _Programs(map_of(forward), transpose_of(backward), both, shapes(inputs), shapes(outputs))
     values = _linear_map.bind(*residual_leaves, *inputs, programs=programs, split=len(residual_leaves))
     return jax.tree.unflatten(of_outputs, values)
+
+
+def filled(x: PyTree, tangent: PyTree) -> PyTree:
+    """A tangent of x, with zeros where it has None and x has an array."""
+    fill = lambda x, t: jnp.zeros(x.shape, x.dtype) if t is None and x is not None else t
+    return jax.tree.map(fill, x, tangent, is_leaf=lambda x: x is None)
 
 
 def _evaluate(*operands: Array, programs: _Programs, split: int) -> list[Array]:

@@ -17,11 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._compat import buffer_set, while_loop
-from ..linalg.pushed import filled
 from .closures import opened
 from .evaluation import freeze, ravel, unravel_like
 from .events import events_found
-from .linear_map import linear_map
+from .linear_map import filled, linear_map
 from .packing import Layout
 from .segments import Row, Segments, choice_of, first_of, remainder, row_of, start_of
 from .stepping import Integration, Progress, constant_fields, ended, stepped

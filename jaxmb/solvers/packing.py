@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from ..linalg.pushed import filled
+from .linear_map import filled
 
 
 class Layout:
