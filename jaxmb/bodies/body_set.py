@@ -16,6 +16,7 @@ from ..linalg.arrays import is_traced, namespace, replaced
 from ..linalg.inertia import AbstractInertia, BlockInertia, CoupledInertia, DiagonalInertia
 from ..linalg.rotations import cross, normalize, rotate
 from ..linalg.sums import placed_sums, unchecked_take
+from ..parts.fields import internal_states
 from .groups import Acting, BodyGroup, BodyPoses, BodyVelocities, ConstraintGroup, CoordinateGroup, Kinematics
 from .layout import Layout
 
@@ -190,6 +191,11 @@ class BodySet(eqx.Module):
     def prepared(self) -> Self:
         """The set for the steps of a motion, with values that depend on parameters alone computed once."""
         return dataclasses.replace(self, groups=tuple(g.prepared() for g in self.groups)) if self.flexible else self
+
+    @property
+    def constant_inertia(self) -> bool:
+        """Whether the inertia is the same at all times."""
+        return not self.layout.flexible and not any(internal_states(g.group.part) for g in self.groups)
 
     @property
     def flexible(self) -> tuple[Any, ...]:

@@ -39,7 +39,7 @@ class SceneCatalogue(Catalogue):
     @of_structure
     def measures(self):
         system = self.system
-        out = body_measures(system.layout, system.body_names) | system.forces.state_measures()
+        out = body_measures(system.layout, system.body_names) | system.state_table.measures()
         out |= reaction_measures(system, self.joint_names()) | scalar_measures(system.layout)
         out |= joint_measures(self.joint_coordinates()) | frame_measures(system.frames, system.layout)
         return out | _drive_measures(system)
@@ -118,8 +118,9 @@ def _drive_measures(system):
             for k, name in enumerate(g.group.names):
                 place = number, np.array(k), shape
                 out[f"{name}.drive_force"] = Measure(shape, _drive_force, place, of_forces=True)
-    for state in system.forces.states:
-        part = system.forces.groups[state.group].group.part
+    table = system.state_table
+    for state in table.fields:
+        part = table.group(state).group.part
         if isinstance(part, AbstractCoordinatePart) and part.drives_by == state.name:
             for k, name in enumerate(state.members):
                 place = "z", np.array(state.start + k * state.size), state.shape
@@ -155,7 +156,7 @@ def _values_of_parts(system, t, q, u):
     return {
         "residual": (*by_part(constraints.position, position), *by_part(constraints.groups, acceleration)),
         "force": by_part(forces.groups, wrenches),
-        "rate": [(name, np.asarray(rates)[index]) for name, index in forces.state_names().items()],
+        "rate": [(name, np.asarray(rates)[index]) for name, index in system.state_names().items()],
     }
 
 
@@ -166,5 +167,5 @@ def _values(system, t, q, u):
         [g.residual(now.t, now.poses) for g in constraints.position],
         [g.acceleration(now, jnp.zeros_like(now.velocities)) for g in constraints.groups],
         [wrenches for wrenches, _ in forces.wrenches(now)],
-        forces.state_rates(now),
+        system.state_table.rates(now),
     )

@@ -77,7 +77,7 @@ class ConstraintSet(eqx.Module):
         """Pairs for each group with moving scalar coordinates: the coordinates' indices, and their inertias."""
         # No force changes the velocity of a friction mode, so any inertia will do.
         modes = [
-            (g.group.body_index[:, k], jnp.ones_like(g.group.part.coefficient, shape=(len(g.group.names),)))
+            (g.group.body_index[:, k], jnp.ones(len(g.group.names), jax.tree.leaves(g.group.part)[0].dtype))
             for g in self.frictions
             for k in range(-g.rows, 0)
         ]

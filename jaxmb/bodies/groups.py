@@ -4,6 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import equinox as eqx
@@ -20,7 +21,6 @@ from ..linalg.rotations import cross
 from ..linalg.sums import unchecked_take
 from ..parts.base import AbstractPart
 from ..parts.boundary import captured
-from ..parts.dry_friction import AbstractStickSlip
 from ..parts.fields import anonymous, entry, inner_parts
 from ..parts.series import AbstractSignal, of_each, of_one_kind
 from ..parts.servo import Servo
@@ -303,6 +303,10 @@ class AbstractGroup(eqx.Module):
             return self._map(lambda at, x: kernel(at(now.t), at(now.t).seen_poses(self._space, x), now.t), now.poses)
         return self._of_motion(name, now)
 
+    def state_rates(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
+        """Rates of the parts' internal states, by the name of the field."""
+        return self._of_motion("state_rates", now)
+
     @staticmethod
     def _raveled(of_parts):
         leaves = jax.tree.leaves(of_parts)
@@ -345,6 +349,10 @@ class BodyGroup(AbstractGroup):
     def inertia(self) -> Float[Array, "parts *matrix"]:
         """Moments of inertia [kg m²] about the mass centres."""
         return jax.vmap(self.group.kernel("inertia"))(self.group.part)
+
+    def state_rates(self, now):
+        kernel = self.group.kernel("state_rates")
+        return self._map(lambda at, x, v: kernel(at(now.t), x, v, now.t), now.poses, now.velocities)
 
 
 class FlexibleGroup(BodyGroup):
@@ -691,10 +699,6 @@ class ForceGroup(AbstractGroup):
 
         return self._map(single, now.poses, now.velocities)
 
-    def state_rates(self, now: Kinematics) -> dict[str, Float[Array, "parts *shape"]]:
-        """Rates of the parts' internal states, by the name of the field."""
-        return self._of_motion("state_rates", now)
-
     def derivatives(self, now: Kinematics) -> tuple[Float[Array, "parts k v k v"], Float[Array, "parts k v k v"]]:
         """Derivatives of `wrenches` by displacements along the velocities of the parts' bodies, and by velocities."""
 
@@ -736,8 +740,7 @@ class NonIdealGroup(AbstractGroup):
     @property
     def needs(self) -> str:
         """What the laws need of their joints: reaction `"wrenches"`, `"multipliers"` in their place, or `"nothing"`."""
-        part = self.group.part
-        return part.needs if isinstance(part, AbstractStickSlip) else "wrenches"
+        return self.group.part.needs
 
     def tensions(self, now: Kinematics, reactions: Float[Array, "parts rows"]) -> Float[Array, "parts spans"]:
         """Tensions of the spans of ropes."""
@@ -747,7 +750,7 @@ class NonIdealGroup(AbstractGroup):
         """Vectors as long as the normal forces of dry friction are large, for each row of the laws."""
         part, d = self.group.part, self._space.dimension
         if self.needs == "nothing":
-            return jnp.eye(1, d, dtype=now.poses.dtype).repeat(len(self.group.names), axis=0)
+            return jnp.zeros((len(self.group.names), d), now.poses.dtype)
         if self.needs == "wrenches":
             forces = reactions[:, part.last, :d]
             return forces if part.rows == 1 else jnp.repeat(forces, part.rows, axis=0)
@@ -775,6 +778,17 @@ class NonIdealGroup(AbstractGroup):
             return part.wrenches_on_bodies(space, x, kernel(part, *seen, now.t))
 
         return self._map(single, now.poses, now.velocities, per_part=(reactions,))
+
+
+# Paths to the groups of a system, by the sets that they belong to.
+BIND_POSITIONS = "constraints.position"
+BIND = (BIND_POSITIONS, "constraints.velocity", "constraints.servos")
+_OTHERS = ("forces.groups", "constraints.nonideal", "frames", "bodies.tendons", "free_joints")
+
+
+def groups_by_path(system: Any) -> dict[str, tuple[Any, ...]]:
+    """All groups of a system's parts, by the path of their set."""
+    return {path: attrgetter(path)(system) for path in ("bodies.groups", *BIND, *_OTHERS)}
 
 
 def along_moves(space: AbstractSpace, function: Callable[[Array], Array], x: Float[Array, "k p"]) -> Array:

@@ -24,6 +24,7 @@ from ..linalg.sums import unchecked_take
 from ..parts.dry_friction import AbstractStickSlip
 from ..parts.modes import CLOSED, STICK, kind_of
 from ..parts.unilateral import AbstractSurfaceContact, AbstractUnilateralConstraint
+from ..system.contact_set import StackedLaws
 from .groups import (
     AbstractConstraintGroup,
     BodyPoses,
@@ -79,6 +80,20 @@ class AbstractLawGroup(AbstractConstraintGroup):
     @abc.abstractmethod
     def motion(self, now: Kinematics, before: Sequence[LawMotion]) -> LawMotion:
         """The rates and biases; `now` has the places of all laws."""
+
+    def laws(self, t: Scalar) -> StackedLaws:
+        """The contact laws of the rows."""
+        part, kernels = self.group.at(t), dict(self.group.kernels)
+        asked = tuple((name, kernels[name]) for name in part.contact_law.asked if name in kernels)
+        laws = part if asked else part.contact_law
+
+        def of_rows(leaf):
+            # Numbers of parts count for each of their rows; those of rows are in order.
+            if not asked and leaf.ndim == 2:
+                return leaf.reshape(-1)
+            return leaf if self.rows == 1 else jnp.repeat(leaf, self.rows, axis=0)
+
+        return StackedLaws(jax.tree.map(of_rows, laws), asked)
 
     def acts(self, poses: BodyPoses) -> Bool[Array, "parts rows"]:
         """Which laws act."""
@@ -280,7 +295,7 @@ class SlipLaws(NonIdealGroup):
     def sizes(self, places: Sequence[LawPlace]) -> Float[Array, "parts"]:
         """The normal forces of contacts by unit multipliers of their gaps; 1 in joints."""
         if self.against is None:
-            return jnp.ones(len(self.group.names), self.group.part.coefficient.dtype)
+            return jnp.ones(len(self.group.names), places[self.number].rows.dtype)
         number, members = self.against
         rows, _, touch = places[number]
         if touch is not None and touch.size is None:

@@ -20,22 +20,10 @@ from ..parts.series import AbstractSignal
 from ..system.design_variables import variables_in_range
 from ..system.parameter_table import ParameterTable
 from ..system.structures import of_structure
-from .groups import Input, together
+from .groups import BIND, BIND_POSITIONS, Input, groups_by_path, together
 
 # The factor by which the size of a scene must change to count as another size.
 _OTHER_SIZE = 10.0
-# Paths to the groups of a system: of position constraints, of all constraints, and of all parts.
-_BIND_POSITIONS = "constraints.position"
-_BIND = (_BIND_POSITIONS, "constraints.velocity", "constraints.servos")
-_GROUPS = (
-    "bodies.groups",
-    *_BIND,
-    "forces.groups",
-    "constraints.nonideal",
-    "frames",
-    "bodies.tendons",
-    "free_joints",
-)
 
 
 class StackedNumber(NamedTuple):
@@ -73,7 +61,7 @@ class SceneParameters(ParameterTable):
 
     @property
     def _groups(self) -> dict[str, tuple[Any, ...]]:
-        return {path: attrgetter(path)(self.system) for path in _GROUPS}
+        return groups_by_path(self.system)
 
     @property
     def _all_groups(self) -> Iterator[Any]:
@@ -173,7 +161,7 @@ class SceneParameters(ParameterTable):
             for single in (single for g in groups for driven in g.group.inputs for single in driven.alone()):
                 (name,) = single.names
                 _, counts = out.get(name, (single.signal, False))
-                out[name] = single.signal, counts or path in _BIND or single.moves
+                out[name] = single.signal, counts or path in BIND or single.moves
         return out
 
     def with_signals(self, signals):
@@ -207,14 +195,14 @@ def _inputs(
         constant = number.declared.constant or number.path in ("bodies.groups", "frames") or number.name in of_frames
         if signal is None or constant:
             continue
-        if number.path == _BIND_POSITIONS and not signal.continuous:
+        if number.path == BIND_POSITIONS and not signal.continuous:
             raise ValueError(
                 f"A position constraint depends on {number.name!r}, so it must not jump: use interpolation='linear' or "
                 "'cubic' instead of 'held'."
             )
         part, declared = groups[number.path][number.group].group.part, number.declared
         places = declared.is_point or declared.is_direction or declared.is_attitude
-        law = laws.get(number.name.split(".")[0]) if places and number.path == _BIND_POSITIONS else None
+        law = laws.get(number.name.split(".")[0]) if places and number.path == BIND_POSITIONS else None
         if law is not None or not part.may_vary(number.keys):
             raise ValueError(
                 f"{number.name!r} cannot be an input: {repr(law) if law else f'a {part.kind}'} takes velocities of "

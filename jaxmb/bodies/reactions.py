@@ -94,8 +94,12 @@ def _force_measures(system) -> dict[str, Measure]:
 def _of_force(system, place, ts, ys, solved):
     del solved
     number, field, member = place
-    alone = system.forces.groups[number].only(member)
-    return jax.vmap(lambda t, y: alone.observables(system.kinematics(t, y.q, y.u))[field][0])(ts, ys)
+
+    def single(t, y):
+        alone = system.at(y).forces.groups[number].only(member)
+        return alone.observables(system.kinematics(t, y.q, y.u))[field][0]
+
+    return jax.vmap(single)(ts, ys)
 
 
 def lifted_ropes(system: Any, motion: Any) -> list[str]:
@@ -149,10 +153,11 @@ def reactions(system: Any, place: Any, ts: Any, ys: State, multipliers: Any) -> 
     def single(t, y, multipliers):
         now = system.kinematics(t, y.q, y.u)
         out = _reaction(system.constraints, of_constraints, now, multipliers)
-        slips = [system.constraints.frictions[at.group].law for at in of_frictions]
+        constraints = system.at(y).constraints
+        slips = [constraints.frictions[at.group].law for at in of_frictions]
         if not slips:
             return out
-        wrenches = system.constraints.nonideal_wrenches(slips, now, multipliers)
+        wrenches = constraints.nonideal_wrenches(slips, now, multipliers)
         return _with_slip(out, slips, of_frictions, now, wrenches)
 
     return jax.vmap(single)(ts, ys, multipliers)
@@ -169,8 +174,9 @@ def applied_wrenches(system: Any, place: Any, ts: Any, ys: State, multipliers: A
     def single(t, y, multipliers):
         now = system.kinematics(t, y.q, y.u)
         if of_laws:
-            laws = [system.constraints.nonideal[at.group] for at in of_laws]
-            wrenches = system.constraints.nonideal_wrenches(laws, now, multipliers)
+            constraints = system.at(y).constraints
+            laws = [constraints.nonideal[at.group] for at in of_laws]
+            wrenches = constraints.nonideal_wrenches(laws, now, multipliers)
             of_parts = [values[at.member] for (values, _), at in zip(wrenches, of_laws, strict=True)]
         else:
             alone = [system.at(y).forces.groups[at.group].only(at.member) for at in of_forces]

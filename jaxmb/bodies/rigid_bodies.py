@@ -19,7 +19,7 @@ from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import DenseJacobian
 from ..parts.base import AbstractLink
 from ..solvers.manifold_term import GapsSeen
-from ..system.contact_set import ContactNumbers, ContactSet
+from ..system.contact_set import ContactLaws, ContactSet, LawTable
 from ..system.design_variables import DesignVariables
 from ..system.equation import Ranks
 from ..system.system import AbstractSystem, GivenInTime
@@ -37,6 +37,7 @@ from .joint_graph import extended_joint_order
 from .layout import Layout
 from .motion import coordinate_names, rate_names
 from .parameters import SceneParameters
+from .state_table import StateTable
 
 # From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
 # velocities: 0.5 ms in blocks, 6.4 ms with dense matrices. Dense matrices of small machines with joints are cheap.)
@@ -238,19 +239,24 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def state_ends(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return tuple(state.stop for state in self.forces.states)
+        return tuple(state.stop for state in self.state_table.fields)
+
+    @property
+    def state_table(self) -> StateTable:
+        """The internal states of the parts."""
+        return StateTable(self)
 
     def state_names(self):
-        return self.forces.state_names()
+        return self.state_table.names()
 
     def with_states(self, z):
-        return dataclasses.replace(self, forces=self.forces.with_states(z))
+        return self.state_table.held(z)
 
     def state_rates(self, t, q, u):
-        return self.forces.state_rates(self.kinematics(t, q, u))
+        return self.state_table.rates(self.kinematics(t, q, u))
 
     def state_scale(self):
-        return lax.stop_gradient(self.forces.state_scale(self.length.dtype))
+        return lax.stop_gradient(self.state_table.scale(self.length.dtype))
 
     # Constraints
 
@@ -330,16 +336,10 @@ class RigidBodySystem(AbstractSystem):
 
     # Contacts and dry friction
 
-    def contact_numbers(self, t):
-        contacts = [g.group.at(t) for g in self.constraints.contacts]
-        frictions = [(g.group.at(t), g.rows) for g in self.constraints.frictions]
-        joined = lambda values: jnp.concatenate([*values, jnp.zeros(0, self.length.dtype)])
-        return ContactNumbers(
-            restitution=joined(part.restitution for part in contacts),
-            peaks=joined(part.peak for part in contacts),
-            coefficient=joined(_of_rows(part.coefficient, rows) for part, rows in frictions),
-            limit=joined(_of_rows(part.limit, rows) for part, rows in frictions),
-        )
+    def contact_laws(self, t):
+        contacts, frictions, dtype = self.constraints.contacts, self.constraints.frictions, self.length.dtype
+        normal, slip = (LawTable.of((g.laws(t) for g in groups), dtype) for groups in (contacts, frictions))
+        return ContactLaws(normal, slip, joined([g.group.at(t).peak for g in contacts], dtype))
 
     @property
     def has_gaps(self):
@@ -378,7 +378,7 @@ class RigidBodySystem(AbstractSystem):
 
     def prepared(self):
         mass = self.mass_matrix
-        if mass is None and not self.layout.flexible:
+        if mass is None and self.bodies.constant_inertia:
             mass = self.bodies.inertia(self.guess.q, self.constraints.scalar_inertias)
             mass = mass.with_inverse(self.guess.u) if self.spatial and self.acceleration_rows else mass
         constraints, bodies = self.constraints.prepared(), self.bodies.prepared()
@@ -473,10 +473,3 @@ class RigidBodySystem(AbstractSystem):
         sets = *(f"constraints.{kind}" for kind in ("position", "velocity", "servos", "nonideal")), "forces.groups"
         places = [(path, k) for path in sets for k, g in enumerate(attrgetter(path)(self)) if g.group.of_time]
         return [lambda system, path=path, k=k: attrgetter(path)(system)[k] for path, k in places]
-
-
-def _of_rows(values: Array, count: int) -> Array:
-    """Values of parts, repeated for each of their rows; those of rows in order."""
-    if values.ndim == 2:
-        return values.reshape(-1)
-    return values if count == 1 else jnp.repeat(values, count, axis=0)

@@ -34,7 +34,7 @@ from ..parts.base import (
     KnownParts,
     rows_of,
 )
-from ..parts.boundary import captured, check_kernels, check_returns
+from ..parts.boundary import captured, check_kernels, check_returns, check_states
 from ..parts.combinations import JointCoupling
 from ..parts.dry_friction import AbstractDryFriction, AbstractStickSlip
 from ..parts.fields import anonymous, as_parameter, declarations, inner_parts, values_of, warn_of_angles
@@ -237,16 +237,22 @@ def as_given(scene: Scene) -> RigidBodySystem:
             nonideal=tuple(NonIdealGroup(g, of_joints(g)) for g in stack(laws, layout, check_kernels)),
             layout=layout,
         ),
-        forces=forces.with_states(None),
+        forces=forces,
         frames=tuple(map(FrameGroup, stack([_observed(frame.name, resolved) for frame in scene.frames], layout))),
         free_joints=tuple(CoordinateGroup(group) for group in constraints if not group.rows),
-        guess=dataclasses.replace(guess, z=forces.initial_states()),
+        guess=guess,
         length=_length([inner for part, _ in parts for inner in (part, *_inner(part))], guess, layout),
         ranks=Ranks(0, 0, 0, 0),
         implied=(),
         elimination=None,
     )
-    return _with_initial_scalars(system)
+    return _with_initial_states(_with_initial_scalars(system))
+
+
+def _with_initial_states(system: RigidBodySystem) -> RigidBodySystem:
+    """The system with the parts' internal states in its guess, and none in the parts."""
+    guess = dataclasses.replace(system.guess, z=system.state_table.initial())
+    return dataclasses.replace(system.state_table.held(None), guess=guess)
 
 
 def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int], dict[str, tuple[int, ...]]]:
@@ -266,7 +272,8 @@ def _placed(scene: Scene, space: AbstractSpace) -> tuple[Layout, dict[str, int],
 
 def _body_groups(scene: Scene, layout: Layout, of_parts: Mapping[str, tuple[int, ...]]) -> tuple[BodyGroup, ...]:
     """The stacked bodies, each with its modal coordinates."""
-    groups = stack([(body, (k, *of_parts.get(body.name, ()))) for k, body in enumerate(scene.bodies)], layout)
+    bodies = [(body, (k, *of_parts.get(body.name, ()))) for k, body in enumerate(scene.bodies)]
+    groups = stack(bodies, layout, check_states)
     kind = lambda group: FlexibleGroup if isinstance(group.part, AbstractFlexibleBody) else BodyGroup
     return tuple(kind(group)(group) for group in groups)
 

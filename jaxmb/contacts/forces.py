@@ -1,6 +1,9 @@
 """Forces of contacts and dry friction at a state, and their sizes of comparison."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ..formulations import Multipliers
 from ..formulations.laws import accelerations_at
@@ -16,7 +19,9 @@ _YIELD = 1e-10
 def largest_force(at: Instant, multipliers):
     """The size to which forces are compared."""
     largest = jnp.max(jnp.abs(multipliers)) + jnp.max(jnp.abs(at.force))
-    largest = at.system.contacts.with_limits(at.system, at.t, largest)
+    hold = sticking(at).force
+    # No other force may act.
+    largest = largest if hold is None else largest + jnp.max(hold)
     return largest + jnp.finfo(largest.dtype).tiny
 
 
@@ -35,16 +40,40 @@ def reserves(at: Instant, multipliers):
         size = _YIELD * jnp.max(jnp.diag(gram)) + jnp.finfo(gram.dtype).tiny
         shared = solve(gram + size * jnp.eye(stick.size, dtype=gram.dtype), gram @ dry)
         dry = jnp.where(stick, shared, dry)
-    limit = at.system.contact_numbers(at.t).limit
-    return jnp.concatenate([forces[:n], limit * normal - sizes_of(contacts.pairs, dry)])
+    coefficient, hold = sticking(at)
+    limit = coefficient * normal if hold is None else coefficient * normal + hold
+    return jnp.concatenate([forces[:n], limit - sizes_of(contacts.pairs, dry)])
 
 
-def friction_coefficients(at: Instant):
-    """Coefficients of friction and limits of stick, as multiples of the force along the gap of a contact. That force is
-    the normal force if the gap grows by one metre a metre.
-    """
-    numbers, sizes = at.system.contact_numbers(at.t), at.contact_place.sizes
-    return numbers.coefficient * sizes, numbers.limit * sizes
+class Limits(NamedTuple):
+    """The largest forces of friction: `coefficient` times a normal force, and a `force`, None if all are zero."""
+
+    coefficient: Float[Array, "frictions"]
+    force: Float[Array, "frictions"] | None
+
+    def along_gaps(self, at: Instant) -> "Limits":
+        """The limits with multiples of the forces along the gaps of contacts. Such a force is the normal force if the
+        gap grows by one metre a metre.
+        """
+        return self._replace(coefficient=self.coefficient * at.contact_place.sizes)
+
+
+def sticking(at: Instant) -> Limits:
+    """The limits of stick."""
+    laws = at.contact_laws.slip
+    return Limits(laws.ask("limit"), laws.ask("hold") if laws.resists else None)
+
+
+def sliding(at: Instant, speeds: Float[Array, "frictions"]) -> Limits:
+    """The forces of slip at some speeds."""
+    laws = at.contact_laws.slip
+    force = laws.ask("resistance", speeds) if laws.resists else None
+    return Limits(laws.ask("coefficient", speeds), force)
+
+
+def slowly_sliding(at: Instant) -> Limits:
+    """The forces of slip at speed zero."""
+    return sliding(at, jnp.zeros(at.system.contacts.m, at.q.dtype))
 
 
 def contact_forces(at: Instant):

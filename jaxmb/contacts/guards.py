@@ -49,7 +49,7 @@ class ContactGuards(AbstractGuards):
         at, modes = Instant(system.at(y), t, q, y.u), contacts.modes(q)
         gaps, rates = at.contact_place.gaps, at.contact_motion.rates
         closing, slips = rates[: contacts.n], modes.of_friction * rates[contacts.n :]
-        peaks, touch = system.contact_numbers(t).peaks, self.touch * system.length
+        peaks, touch = at.contact_laws.peaks, self.touch * system.length
         free = jnp.where(modes.open, gaps * (1 - 0.5 * gaps / peaks), system.length)
         free = contacts.sharing.guarded(at, gaps, self.tolerance, free)
         begins = modes.open & (gaps <= touch)

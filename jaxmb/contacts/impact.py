@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 from .._types import Scalar, State
 from ..formulations import AbstractFormulation
 from ..linalg.pairs import of_pairs
-from ..linalg.pushed import dense, push
+from ..linalg.pushed import filled, push
 from ..linalg.sums import with_entries
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
@@ -115,14 +115,14 @@ def _impact_jvp(primals, tangents):
     after, event = _impact(*primals)
     system, t, y, event = _without_second_derivative((system, t, y, event))
     contacts = system.contacts
-    dq, du, dt = dense(dy.q, y.q), dense(dy.u, y.u), dense(dt, t)
+    dq, du, dt = filled(y.q, dy.q), filled(y.u, dy.u), filled(t, dt)
 
     # The time of the event changes, and with it the time and the state there, by the equations before it.
     frame = MovingFrame.of((system, t, y.q), (dsystem, dt, dq))
     dlate = _later(event, Instant(system, t, y.q, event.at), frame, (y.u, du))
     if dated or any(contacts.releases):
         dlate = dlate + _release(system, tolerance, event, (t, y), (dsystem, dt, dy))
-    dz = None if y.z is None else dense(dy.z, y.z)
+    dz = filled(y.z, dy.z)
     change = _together if event.group is None else _apart
     dafter, late, impulses, energy = change(system, t, y, event, dlate, frame, (dsystem, dt, dq, du, dz))
     dq = jnp.where(np.isin(np.arange(system.nq), contacts.places), 0.0, dafter.q)

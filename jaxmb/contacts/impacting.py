@@ -21,7 +21,7 @@ from ..system.contact_set import ContactSet
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .dry_laws import Answers
-from .forces import free_accelerations, friction_coefficients, other_rows
+from .forces import free_accelerations, other_rows
 from .groups import group_sums, groups_of, least_in_group, of_contacts
 from .problem import Laws, Problem, is_implied
 from .tolerance import REST, ContactTolerance
@@ -219,7 +219,7 @@ class Impacting:
     @classmethod
     def of(cls, at: Instant, formulation, tolerance: ContactTolerance) -> "Impacting":
         contacts, moves = at.system.contacts, Moves.at(at)
-        laws = Laws(moves.rows @ moves.by_unit.T, contacts, *friction_coefficients(at))
+        laws = Laws.of(at, moves.rows @ moves.by_unit.T)
         return cls(at, formulation, tolerance, contacts.modes(at.q), moves, laws, tolerance.slow(at.system, at.u))
 
     @property
@@ -253,7 +253,7 @@ class Impacting:
     @property
     def phases(self) -> int:
         """The number of phases of an impact."""
-        return 2 if any(self.contacts.by_poisson) else 1
+        return max(self.contacts.phases, default=1)
 
     @property
     def turns(self) -> int:
@@ -276,11 +276,10 @@ class Impacting:
         """
         at = self.at.with_(u=u)
         udot, multipliers, opening = free_accelerations(at, self.formulation, self.moves.projector)
-        if not self.contacts.in_joints.any():
+        if not self.contacts.of_reactions:
             return udot, opening, None
         at, answers = self.contacts.stuck(at, self.moves.answers)
-        of_all = jax.vmap(at.friction_reactions)(jnp.concatenate([multipliers[None], answers]))
-        return udot, opening, self.contacts.by_forces(of_all)
+        return udot, opening, jax.vmap(at.friction_reactions)(jnp.concatenate([multipliers[None], answers]))
 
     # The time of the event
 
@@ -337,16 +336,16 @@ class Impacting:
 
     # The turns of a round
 
-    def bounces(self, when: When):
-        """The rates at which gaps would open by Newton's law."""
-        return self.system.contact_numbers(self.at.t).restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)
+    def closing(self, when: When):
+        """The rates at which gaps close, zero for others."""
+        return jnp.maximum(-when.at[: self.contacts.n], 0.0)
 
     def impulse_of(self, when: When, low, share, reactions) -> Problem:
         """The problem of the impulses. Contacts that are `low` do not bounce, others bounce with a share of the whole
         rebound; by Poisson's law none bounces at the end of compression.
         """
         share = of_contacts(share, self.contacts.n)
-        back = jnp.where(low | np.array(self.contacts.by_poisson, bool), 0.0, share * self.bounces(when))
+        back = jnp.where(low, 0.0, share * self.at.contact_laws.normal.ask("rebound", self.closing(when)))
         approach = when.at + self.moves.rows @ self.moves.jump - jnp.pad(back, (0, self.contacts.m))
         if self.contacts.pairs:
             # Rounding errors have no direction.
@@ -360,9 +359,8 @@ class Impacting:
     def expand(self, k, before: Round, answers, impulses) -> Round:
         """The end of the compression, and the problem of the expansion: impulses beyond the least ones."""
         when = before.when
-        again = self.system.contact_numbers(self.at.t).restitution * impulses[: self.contacts.n]
-        pushes = np.array(self.contacts.by_poisson, bool) & ~before.low
-        again = jnp.where(pushes, of_contacts(before.trial.share, self.contacts.n) * again, 0.0)
+        again = self.at.contact_laws.normal.ask("pushed", impulses[: self.contacts.n], self.closing(when))
+        again = jnp.where(before.low, 0.0, of_contacts(before.trial.share, self.contacts.n) * again)
         u = self.moved(k, when, impulses)
         free = before.problem.free + self.influence @ impulses
         free = jnp.where(jnp.abs(free) <= REST * self.sizes_of_rates(u, when.u), 0.0, free)
@@ -394,7 +392,7 @@ class Impacting:
         size = group_sums(balance, jnp.abs(impulses) * (jnp.abs(when.at) + jnp.abs(rate)))
         of_share = balance, (gained, size), before.trial.share
         struck = Struck(answers, impulses, after, rate, udot, resting, ended, *of_share)
-        forces = self.laws.of_forces(opening, reactions, resting, slips, self.modes, before.forces)
+        forces = self.laws.of_forces(opening, reactions, resting, rate[n:], slips, self.modes, before.forces)
         return before._replace(problem=forces, struck=struck, solvable=solvable)
 
     def groups(self, touching, resting, ended, turned):
@@ -450,14 +448,15 @@ class Impacting:
 
         **Arguments:** `curve`: the second derivatives of the gaps.
         """
-        when, struck, restitution = before.when, before.struck, self.system.contact_numbers(self.at.t).restitution
-        rate, bounce = struck.rate[: self.contacts.n], self.bounces(when)
+        when, struck, rate = before.when, before.struck, before.struck.rate[: self.contacts.n]
+        closing = self.closing(when)
+        restitution = self.at.contact_laws.normal.ask("ratio", closing)
         falls = jnp.where(curve < 0, -curve, 1.0)
         opens = rate**2 <= 2 * falls * self.tolerance.bounce
         low = when.touching & ~struck.resting & (curve < 0) & opens & (restitution < 1)
         low = jnp.where(is_first, low, before.low)
         # Each bounce takes `restitution` times as long as the previous bounce.
-        bounces = low & (bounce > self.tolerance.slowest)
+        bounces = low & (restitution * closing > self.tolerance.slowest)
         ratio = jnp.where(bounces, restitution, 0.0)
         rest = jnp.where(bounces, 2 * rate / (falls * (1 - ratio)), 0.0)
         return low, jnp.where(is_first, rest, before.rest)

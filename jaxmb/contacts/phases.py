@@ -16,9 +16,9 @@ from ..linalg.elimination import solve
 from ..linalg.pairs import of_pairs
 from ..linalg.pushed import push
 from ..linalg.rotations import norm
-from ..system.contact_set import ContactSet
+from ..system.contact_set import ContactSet, LawTable
 from ..system.instant import Instant
-from .forces import friction_coefficients, other_rows
+from .forces import other_rows, slowly_sliding
 from .groups import HOLDS, group_sums, of_contacts
 from .impacting import Event, Phase
 
@@ -27,20 +27,24 @@ class Frame(NamedTuple):
     """Gaps and slips at a place, and at the same place in motion.
 
     **Fields:** the `gaps`; `rows`, the derivatives of the rates of gaps and slips by velocities; the rates of a system
-    at rest, `drift`; the `coefficient` of friction as a multiple of the force along the gap, and of `restitution`.
+    at rest, `drift`; the `coefficient` of friction as a multiple of the force along the gap; the `laws` of impact.
     """
 
     gaps: Float[Array, "contacts"]
     rows: Float[Array, "laws nu"]
     drift: Float[Array, "laws"]
     coefficient: Float[Array, "frictions"]
-    restitution: Float[Array, "contacts"]
+    laws: LawTable
 
     @classmethod
     def of(cls, system: Any, t: Float[Array, ""], q: Float[Array, "nq"]) -> "Frame":
         at = Instant(system, t, q, jnp.zeros(system.nu, q.dtype))
-        place, drift, (coefficient, _) = at.contact_place, at.contact_motion.rates, friction_coefficients(at)
-        return cls(place.gaps, place.gradients, drift, coefficient, system.contact_numbers(t).restitution)
+        place, drift, coefficient = (
+            at.contact_place,
+            at.contact_motion.rates,
+            slowly_sliding(at).along_gaps(at).coefficient,
+        )
+        return cls(place.gaps, place.gradients, drift, coefficient, at.contact_laws.normal)
 
     def rates(self, u: Float[Array, "nu"]) -> Float[Array, "laws"]:
         """The rates of gaps and the velocities of slip."""
@@ -62,6 +66,13 @@ class MovingFrame(NamedTuple):
         """With the tangent of another in addition, so many times."""
         return self._replace(change=jax.tree.map(lambda a, b: a + time * b, self.change, by.change))
 
+    def of_impact(
+        self, question: str, numbers: tuple[Array, ...], change: tuple[Array, ...]
+    ) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
+        """What the laws of impact answer, and the tangent, with the tangents of their numbers."""
+        ask = lambda laws, *numbers: laws.ask(question, *numbers)
+        return jax.jvp(ask, (self.here.laws, *numbers), (self.change.laws, *change))
+
     def change_of_rates(self, u: Float[Array, "nu"], du: Float[Array, "nu"]) -> Float[Array, "laws"]:
         """The tangent of the rates, with the tangent of the velocities."""
         return self.change.rates(u) + self.here.rows @ du
@@ -73,7 +84,7 @@ class Phases:
 
     **Fields:** `at`: system, t and q at the `event`; their `tangents`, and `du`, the tangent of the velocities before
     it; the `frame` there; the `projector` on the other constraints; `moves`: the changes of velocities by unit
-    impulses; contacts that `rebound` by Newton's law.
+    impulses.
     """
 
     event: Event
@@ -83,7 +94,6 @@ class Phases:
     frame: MovingFrame
     projector: Any
     moves: Float[Array, "laws nu"]
-    rebound: Bool[Array, "contacts"]
 
     @classmethod
     def of(cls, event: Event, at, tangents, du, frame: MovingFrame) -> "Phases":
@@ -91,8 +101,7 @@ class Phases:
         after = Instant(system, t, q, event.u)
         projector, none = other_rows(after).projector(after.inertia), jnp.zeros(system.acceleration_rows, q.dtype)
         moves = jax.vmap(lambda force: projector.solve(force, none)[0])(frame.here.rows)
-        rebound = ~event.low & ~np.array(system.contacts.by_poisson, bool)
-        return cls(event, at, tangents, du, frame, projector, moves, rebound)
+        return cls(event, at, tangents, du, frame, projector, moves)
 
     @property
     def rows(self) -> Float[Array, "laws nu"]:
@@ -129,6 +138,13 @@ class Phases:
         return dataclasses.replace(self, event=event, tangents=tangents, du=du, frame=frame)
 
     @property
+    def closing(self) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
+        """The rates at which gaps close before the impact, zero for others, and the tangents."""
+        n, at = self.contacts.n, self.event.at
+        rates, change = self.frame.here.rates(at)[:n], self.frame.change_of_rates(at, self.du)[:n]
+        return jnp.maximum(-rates, 0.0), -change
+
+    @property
     def share(self) -> Float[Array, "*contacts"]:
         """The share of the rebounds of each contact."""
         return of_contacts(self.event.share, self.contacts.n)
@@ -137,9 +153,9 @@ class Phases:
         """The derivatives of all impulses, and of the velocities after them."""
         event, contacts, frame = self.event, self.contacts, self.frame
         # Velocities and impulses also change with the share of the rebounds.
-        rates = frame.here.rates(event.at)
-        bounce = frame.here.restitution * jnp.maximum(-rates[: contacts.n], 0.0)
-        bounce = jnp.pad(jnp.where(self.rebound, bounce, 0.0), (0, contacts.m))
+        rates, (closing, _) = frame.here.rates(event.at), self.closing
+        bounce = jnp.where(event.low, 0.0, frame.here.laws.ask("rebound", closing))
+        bounce = jnp.pad(bounce, (0, contacts.m))
         impulses, change, by_share = (self.in_one if event.compression is None else self.in_two)(bounce)
 
         # At this share no energy is gained.
@@ -167,24 +183,25 @@ class Phases:
 
     def in_two(self, bounce):
         """The same for an impact by Poisson's law."""
-        event, compression, (here, moved) = self.event, self.event.compression, self.frame
+        event, compression = self.event, self.event.compression
         assert compression is not None
         n, m = self.contacts.n, self.contacts.m
         none = jnp.zeros(n, event.u.dtype)
         first, between, matrix = self.solved(event.at, self.du, compression, none)
         first_by_share = lambda dshare: solve(matrix, jnp.where(compression.held, dshare * bounce, 0.0))
-        pushes = ~event.low & np.array(self.contacts.by_poisson, bool)
-        again = here.restitution * first[:n] + moved.restitution * compression.impulses[:n]
-        normal = jnp.where(pushes, self.share * again, 0.0)
+        (closing, dclosing), struck = self.closing, compression.impulses[:n]
+        _, again = self.frame.of_impact("pushed", (struck, closing), (first[:n], dclosing))
+        normal = jnp.where(event.low, 0.0, self.share * again)
         last = Phase(event.u, event.held, event.slips, event.impulses - compression.impulses)
         second, change, last_matrix = self.solved(compression.u, between, last, normal)
 
         def by_share(dshare):
             first = first_by_share(dshare)
-            normal = dshare * compression.impulses + event.share * first
-            normal = jnp.where(pushes, here.restitution * normal[:n], 0.0)
-            closing = dshare * bounce - self.rows @ (first @ self.moves)
-            return first + solve(last_matrix, jnp.where(event.held, closing, jnp.pad(normal, (0, m))))
+            pushed = lambda impulses: self.frame.here.laws.ask("pushed", impulses, closing)
+            pushed, again = jax.jvp(pushed, (struck,), (first[:n],))
+            normal = jnp.where(event.low, 0.0, of_contacts(dshare, n) * pushed + self.share * again)
+            asked = dshare * bounce - self.rows @ (first @ self.moves)
+            return first + solve(last_matrix, jnp.where(event.held, asked, jnp.pad(normal, (0, m))))
 
         return first + second, change, by_share
 
@@ -221,9 +238,9 @@ class Phases:
         # Rows of modes have no right-hand side.
         is_law, forces = np.isin(np.arange(rates.size), rows), forces - phase.impulses @ moved.rows
         plain, _ = self.projector.solve(-forces, jnp.where(is_law, 0.0, -rates))
-        closing, change = -here.rates(self.event.at)[:n], -self.frame.change_of_rates(self.event.at, self.du)[:n]
-        bounce = moved.restitution * closing + here.restitution * change
-        bounces = phase.held[:n] & self.rebound & (closing > 0)
+        closing, change = self.closing
+        _, bounce = self.frame.of_impact("rebound", (closing,), (change,))
+        bounces = phase.held[:n] & ~self.event.low & (closing > 0)
         bounce = jnp.pad(jnp.where(bounces, self.share * bounce, 0.0), (0, contacts.m))
         asked = bounce - moved.rates(phase.u) - here.rows @ plain
         law, right = jnp.eye(rows.size, dtype=plain.dtype), jnp.pad(normal, (0, contacts.m))

@@ -22,7 +22,7 @@ from ..linalg.sums import with_entries
 from ..parts.modes import CLOSED, IMPLIED
 from ..system.instant import Instant
 from ..system.sharing import NoSharing
-from .forces import friction_coefficients, other_rows
+from .forces import other_rows, sliding
 
 # Shares of forces change slip if its acceleration changes by this fraction of the friction of one contact; along a
 # motion it is seen at the second one.
@@ -81,10 +81,11 @@ class Sharing(NoSharing):
         system, contacts = at.system, at.system.contacts
         n, modes = contacts.n, contacts.modes(at.q)
         implied = modes.shut & ~modes.closed
-        influence, (coefficient, _) = _influence(at), friction_coefficients(at)
         rates, tolerance = at.contact_motion.rates[n:], tolerance.in_metres(system)
-        slips = jnp.where(_is_fast(contacts.pairs, rates, tolerance.slow(system, at.u)), modes.slips(rates), 0.0)
-        change = _change(contacts, influence, coefficient, slips, modes.closed, implied)
+        speeds = sizes_of(contacts.pairs, rates)
+        slips = jnp.where(_is_fast(speeds, tolerance.slow(system, at.u)), modes.slips(rates), 0.0)
+        slides = sliding(at, speeds).along_gaps(at)
+        change = _change(contacts, _influence(at), slides.coefficient, slips, modes.closed, implied)
         # Contacts that others imply at one pose may part, or meet, at another; and slip may come to depend on shares.
         return jnp.where(implied, tolerance.near * (1 - change / _SEEN) - jnp.abs(gap), values)
 
@@ -101,11 +102,11 @@ class Sharing(NoSharing):
     def determined(self, laws, settled, implied, slow):
         last, struck, n = settled.answers, settled.struck, laws.contacts.n
         rate, ended = struck.rate[n:], struck.ended
-        sliding = jnp.where(
-            _is_fast(laws.contacts.pairs, rate, slow), rate / jnp.where(ended, 1.0, laws.sizes(rate)), 0.0
-        )
-        slips = jnp.where(ended, last.slips, sliding)
-        change = _change(laws.contacts, laws.influence, laws.coefficient, slips, last.closed, implied)
+        speeds = laws.sizes(rate)
+        slips = jnp.where(_is_fast(speeds, slow), rate / jnp.where(ended, 1.0, speeds), 0.0)
+        slips = jnp.where(ended, last.slips, slips)
+        coefficient, _ = laws.sliding(jnp.where(ended, 0.0, speeds))
+        change = _change(laws.contacts, laws.influence, coefficient, slips, last.closed, implied)
         return change <= _UNDETERMINED
 
     def multipliers(self, at, multipliers):
@@ -138,9 +139,9 @@ def _influence(at):
     return rows @ jax.vmap(lambda row: projector.solve(row, none)[0])(rows).T
 
 
-def _is_fast(pairs, rates, slow):
+def _is_fast(speeds, slow):
     """Whether directions of slip are known; near the end of slip they have rounding errors."""
-    return jnp.max(sizes_of(pairs, rates), initial=0.0) > _FAST * slow
+    return jnp.max(speeds, initial=0.0) > _FAST * slow
 
 
 def _change(contacts, influence, coefficient, slips, closed, implied):

@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .._compat import custom_vmap, sequential_vmap
+from .pushed import filled
 
 # The largest number of rows for each way of sweeping; see jaxmb.linalg for the measurement.
 _ROTATING_SIZE = 18
@@ -94,8 +95,7 @@ def _for_matrix(factor, matrix):
 
 @_for_matrix.def_jvp
 def _for_matrix_jvp(primals, tangents):
-    factor, change = _for_matrix(*primals), tangents[1]
-    change = jnp.zeros_like(primals[1]) if change is None else change
+    factor, change = _for_matrix(*primals), filled(primals[1], tangents[1])
     pushed = factor.right_inverse @ change
     return factor, Factor(-(pushed @ factor.right_inverse), -(pushed @ factor.null_space), None)
 

@@ -3,18 +3,17 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import PyTree
 
 
 def push(function: Any, at: tuple[Any, ...], along: tuple[Any, ...]) -> Any:
     """The tangent of a function's value, with zeros for None."""
-    value, tangent = eqx.filter_jvp(function, at, along)
-    if isinstance(value, tuple):
-        return tuple(dense(*both) for both in zip(tangent, value, strict=True))
-    return dense(tangent, value)
+    return filled(*eqx.filter_jvp(function, at, along))
 
 
-def dense(tangent: Float[Array, "*n"] | None, like: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """A tangent, zeros for None."""
-    return jnp.zeros_like(like) if tangent is None else tangent
+def filled(x: PyTree, tangent: PyTree) -> Any:
+    """A tangent of x, with zeros where it has None and x has an array."""
+    fill = lambda x, t: jnp.zeros(x.shape, x.dtype) if t is None and x is not None else t
+    return jax.tree.map(fill, x, tangent, is_leaf=lambda x: x is None)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Coordinates, Scalar, State, Velocities
 from ..formulations.laws import Memory, laws_of
-from ..linalg.pushed import dense, push
+from ..linalg.pushed import filled, push
 from ..system.instant import Instant, given
 
 
@@ -225,4 +225,4 @@ def _on_constraints(here, at, along):
 
 def dense_along(along: Instant, at: Instant) -> Instant:
     """The tangent of an instant, with zeros for None in coordinates and velocities."""
-    return along.with_(q=dense(along.q, at.q), u=dense(along.u, at.u))
+    return along.with_(q=filled(at.q, along.q), u=filled(at.u, along.u))

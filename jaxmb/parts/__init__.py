@@ -50,6 +50,7 @@ from .base import (
     AbstractForce as AbstractForce,
     AbstractPotentialForce as AbstractPotentialForce,
     AbstractDynamicForce as AbstractDynamicForce,
+    AbstractDynamicPart as AbstractDynamicPart,
     AbstractNonIdeal as AbstractNonIdeal,
     AbstractTendon as AbstractTendon,
 )
@@ -58,6 +59,13 @@ from .unilateral import (
     AbstractRigidContact as AbstractRigidContact,
     AbstractGeometricContact as AbstractGeometricContact,
     AbstractSurfaceContact as AbstractSurfaceContact,
+)
+from .contact_laws import (
+    AbstractImpactLaw as AbstractImpactLaw,
+    AbstractSlipLaw as AbstractSlipLaw,
+    Newton as Newton,
+    Poisson as Poisson,
+    Coulomb as Coulomb,
 )
 from .contact import AbstractNormalLaw as AbstractNormalLaw, AbstractFrictionLaw as AbstractFrictionLaw
 from .terrain import AbstractTerrain as AbstractTerrain

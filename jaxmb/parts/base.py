@@ -185,6 +185,39 @@ class AbstractSpatialPart(AbstractPart):
     dimensions: ClassVar[tuple[int, ...]] = (3,)
 
 
+class AbstractDynamicPart(AbstractPart):
+    """A part with internal states of first order; another base class says what else it is.
+
+    Forces, laws of friction and contacts, and bodies may depend on their internal states, such as friction that fades
+    as a brake becomes hot. The rows of constraints must not. See `AbstractDynamicForce` for forces.
+
+    ```python
+    class FadingFriction(jaxmb.DryFriction, jaxmb.parts.AbstractDynamicPart):
+        fade: jaxmb.parts.Number = jaxmb.parts.internal_state(unit="1")
+        lag: jaxmb.parts.Number = jaxmb.parts.parameter(unit="s", sign="positive", default=1.0)
+
+        @property
+        def contact_law(self):
+            return jaxmb.parts.Coulomb(self.coefficient * (1 - self.fade), None)
+
+        def state_rates(self, space, poses, velocities, t):
+            return {"fade": (0.5 - self.fade) / self.lag}
+
+    brake = FadingFriction("brake", "pin", coefficient=0.4, radius=0.1, lag=2.0)
+    ```
+    """
+
+    @abc.abstractmethod
+    def state_rates(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> dict[str, Array]:
+        """The rate of every internal state [its unit/s], by the name of the field."""
+
+    def state_sizes(self) -> dict[str, Any]:
+        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
+        control, the largest value of a state so far counts as at least 1e-4 of its size.
+        """
+        return {}
+
+
 class AbstractBody(AbstractPart):
     """A body with mass. The origin of its frame is the mass centre, unless a field `centre` gives the mass centre [m]
     in the frame.
@@ -825,23 +858,13 @@ class AbstractPotentialForce(AbstractForce):
         return self.energy(space, poses, t)
 
 
-class AbstractDynamicForce(AbstractForce):
+class AbstractDynamicForce(AbstractForce, AbstractDynamicPart):
     """A force law with internal states of first order: a motor with lag, a tyre with relaxation, a filter.
 
     Each state is a field declared with `fields.internal_state`. It holds the current value in the kernels `wrenches`,
     `state_rates` and `energy` (for a part with a potential). `State.z` holds the internal states of all parts; their
     names are `"motor.torque"`.
     """
-
-    @abc.abstractmethod
-    def state_rates(self, space: AbstractSpace, poses: Poses, velocities: Velocities, t: Scalar) -> dict[str, Array]:
-        """The rate of every internal state [its unit/s], by the name of the field."""
-
-    def state_sizes(self) -> dict[str, Any]:
-        """Hook: the typical sizes of internal states by the name of the field, default one in its unit. For error
-        control, the largest value of a state so far counts as at least 1e-4 of its size.
-        """
-        return {}
 
 
 class AbstractNonIdeal(AbstractActor):
@@ -854,6 +877,8 @@ class AbstractNonIdeal(AbstractActor):
 
     joint: AbstractVar[str]
     stage: ClassVar[int] = 2
+    # As for `AbstractStickSlip`.
+    needs: ClassVar[str] = "wrenches"
 
     @property
     def sources(self):

@@ -20,7 +20,7 @@ from ..linalg.jitted import on_host
 from .base import (
     AbstractBody,
     AbstractConstraint,
-    AbstractDynamicForce,
+    AbstractDynamicPart,
     AbstractFlexibleBody,
     AbstractForce,
     AbstractLink,
@@ -28,6 +28,7 @@ from .base import (
     AbstractPotentialForce,
     AbstractVelocityConstraint,
 )
+from .contact_laws import AbstractImpactLaw, AbstractSlipLaw
 from .dry_friction import AbstractStickSlip
 from .fields import declarations, entry, internal_states
 from .space import AbstractSpace
@@ -45,25 +46,50 @@ def check_kernels(part: Any, space: AbstractSpace, bodies: int) -> None:
 
     **Arguments:** `part`: with every number filled in; `bodies`: number of bodies that it acts on.
     """
-    if internal_states(part) and not isinstance(part, AbstractDynamicForce):
-        raise ValueError(
-            f"{part.label} has internal states; derive it from AbstractDynamicForce, which declares their rates."
-        )
+    check_states(part, space, bodies)
     for name, shape, given in _kernels(part, space, bodies):
         kernel = lambda *arguments, name=name: getattr(part, name)(space, *arguments)
         if name == "gaps":
             _check_gaps(part, kernel, given)
-        elif shape is None:
-            _check_state_rates(part, kernel, given)
-        else:
+        elif shape is not None:
             check_returns(part.label, name, shape, kernel, *given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
         rows = sum(element.rows(space.dimension) for element in part.elements)
         if rows != part.rows:
             raise ValueError(f"{part.label}: its elements have {rows} rows, but rows = {part.rows}.")
     _check_declared(part, space, bodies)
+    if isinstance(part, AbstractStickSlip | AbstractUnilateralConstraint) and is_of_user(part):
+        _check_contact_law(part)
     if isinstance(part, AbstractForce) and not isinstance(part, AbstractPotentialForce) and hasattr(part, "energy"):
         raise ValueError(f"{part.label} defines an energy that is never used; derive it from AbstractPotentialForce.")
+
+
+def check_states(part: Any, space: AbstractSpace, bodies: int) -> None:
+    """Refuse internal states without rates, rates of another shape, and constraints that depend on the states."""
+    states = internal_states(part)
+    if states and not isinstance(part, AbstractDynamicPart):
+        kind = "AbstractDynamicForce" if isinstance(part, AbstractForce) else "AbstractDynamicPart"
+        raise ValueError(f"{part.label} has internal states; derive it from {kind}, which declares their rates.")
+    where = lambda part: [entry(part, keys) for keys in states.values()]
+    for name, _, given in _kernels(part, space, bodies) if states else ():
+        if name == "state_rates":
+            _check_state_rates(part, lambda *arguments: part.state_rates(space, *arguments), given)
+        row = lambda values, given, name=name: getattr(eqx.tree_at(where, part, values), name)(space, *given)
+        if name in ("residual", "gap", "slips") and depends(row, (where(part), given), 0):
+            raise ValueError(f"{part.label}: its {name} must not depend on its internal states.")
+
+
+def _check_contact_law(part: Any) -> None:
+    """Refuse a contact law of a user's class that is none, or that does not return numbers."""
+    law, kind = part.contact_law, AbstractSlipLaw if isinstance(part, AbstractStickSlip) else AbstractImpactLaw
+    if not isinstance(law, kind):
+        raise ValueError(f"{part.label}: contact_law must be a parts.{kind.__name__}, got {type(law).__name__}.")
+    if isinstance(law, AbstractSlipLaw) and law.resists and part.needs == "normal":
+        raise ValueError(f"{part.label}: a contact has no friction without a normal force; leave out resists=True.")
+    one = np.ones((), np.dtype(jnp.result_type(float)))
+    for name, count in law.asked.items():
+        answer = lambda *numbers, name=name, count=count: getattr(law, name)(*numbers[:count])
+        check_returns(part.label, f"contact_law.{name}", (), answer, *[one] * max(count, 1))
 
 
 def _check_declared(part: Any, space: AbstractSpace, bodies: int) -> None:
@@ -128,6 +154,11 @@ def _traced_kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tu
         zeta = np.zeros(len(part.modes), np.dtype(jnp.result_type(float)))
         for name, given in (("mass_matrix", [zeta]), ("energy", [zeta]), ("internal_force", [zeta, zeta])):
             yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
+    if isinstance(part, AbstractStickSlip | AbstractUnilateralConstraint):
+        one = np.ones((), np.dtype(jnp.result_type(float)))
+        for name, count in getattr(part.contact_law, "asked", {}).items():
+            ask = lambda part, *numbers, name=name: getattr(part.contact_law, name)(*numbers)
+            yield name, (ask, [one] * count)
     for name, _, given in _kernels(part, space, bodies):
         yield name, (lambda part, *arguments, name=name: getattr(part, name)(space, *arguments), given)
     if isinstance(part, AbstractConstraint) and part.declares("elements"):
@@ -209,12 +240,12 @@ def _kernels(part: Any, space: AbstractSpace, bodies: int) -> Iterator[tuple[str
         if part.has_gaps:
             yield "gaps", None, [poses, t]
             yield "gap_pace", (), [poses, velocities, t]
-        if isinstance(part, AbstractDynamicForce):
-            yield "state_rates", None, [poses, velocities, t]
         if isinstance(part, AbstractPotentialForce) and part.conservative:
             yield "energy", (), [poses, t]
             if part.stores_by_speed:
                 yield "energy_in_motion", (), [poses, velocities, t]
+    if isinstance(part, AbstractDynamicPart):
+        yield "state_rates", None, [poses, velocities, t]
     if isinstance(part, AbstractLink) and part.lost_heading is not None:
         yield "heading", (space.dimension,), [poses]
 
@@ -235,7 +266,7 @@ def _arguments(space: AbstractSpace, bodies: int) -> tuple[Any, Any, Any]:
     return poses, np.zeros((bodies, space.velocity_size), dtype), np.zeros((), dtype)
 
 
-def _check_state_rates(part: AbstractDynamicForce, kernel: Callable[..., Any], given: list[Any]) -> None:
+def _check_state_rates(part: AbstractDynamicPart, kernel: Callable[..., Any], given: list[Any]) -> None:
     """As `check_returns`, for the rates of internal states: each must have the shape of its state."""
     states = internal_states(part)
     rates = _evaluated(part.label, "state_rates", kernel, tuple(given))

@@ -24,6 +24,7 @@ from .base import (
     Velocities,
 )
 from .combinations import JointCoupling
+from .contact_laws import AbstractSlipLaw, Coulomb, GivenForce
 from .coordinate_parts import AbstractCoordinateForce, AbstractOfJoints, AbstractScalarPart
 from .modes import CLOSED, STICK, kind_of, slip_direction
 from .space import AbstractSpace, rate_of
@@ -41,12 +42,14 @@ class AbstractStickSlip(AbstractVelocityConstraint):
     linear: ClassVar[bool] = True
     # The number of directions of one slip: two rows that stick and slip together, or one.
     directions: AbstractVar[int]
-    # Those of slip and stick, as multiples of the normal forces; the latter may be None.
-    coefficient: AbstractVar[Any]
-    static_coefficient: AbstractVar[Any]
-    # What the law needs of its joint: reaction "wrenches", the "multipliers" of its rows, or the "normal" force of a
-    # contact; "nothing" if the normal force is one, and the coefficients are forces.
+    # What the law needs of its joint: reaction "wrenches", the "multipliers" of its rows, the "normal" force of a
+    # contact, or "nothing" if the friction does not depend on a normal force.
     needs: AbstractVar[Any]
+
+    @property
+    @abc.abstractmethod
+    def contact_law(self) -> AbstractSlipLaw:
+        """The law of each row."""
 
     @property
     def coupled(self) -> bool:
@@ -62,13 +65,6 @@ class AbstractStickSlip(AbstractVelocityConstraint):
     def joint_name(self) -> str:
         """The name of the joint or contact that rubs, whose force is the normal force."""
 
-    @property
-    def limit(self) -> Array:
-        """The coefficient of stick; not below the coefficient of slip, which may be an input."""
-        if self.static_coefficient is None:
-            return self.coefficient
-        return jnp.maximum(self.coefficient, self.static_coefficient)
-
     def residual(self, space, poses, velocities, t):
         del t
         slip, modes = self.slips(space, poses, velocities), velocities[-self.rows :, 0]
@@ -79,12 +75,24 @@ class AbstractStickSlip(AbstractVelocityConstraint):
         """The velocities of slip [m/s], from poses and velocities of all bodies and modes."""
 
     @abc.abstractmethod
+    def normal_force(self, space: AbstractSpace, poses: Poses, reactions: Any) -> Float[Array, "..."]:
+        """The normal force [N], from what the law `needs` of its joint."""
+
     def slip_forces(
         self, space: AbstractSpace, poses: Poses, slips: Float[Array, "rows"], reactions: Any
     ) -> Float[Array, "rows"]:
         """The forces [N] of slip along the directions of slip, zero in stick, from the `slips` and from what the law
         `needs` of its joint.
         """
+        # The direction does not depend on reactions; an iteration solves for these.
+        law, against = self.contact_law, -slip_direction(self._modes(poses), slips)
+        speed = norm(slips) if law.varies else jnp.zeros((), slips.dtype)
+        size = law.coefficient(speed) * self.normal_force(space, poses, reactions)
+        return (size + law.resistance(speed) if law.resists else size) * against
+
+    def limits(self, space: AbstractSpace, poses: Poses, reactions: Any) -> Float[Array, "rows"]:
+        """The normal force for each direction of slip; linear in the reactions, from contacts and joint rows."""
+        return jnp.broadcast_to(self.normal_force(space, poses, reactions), (self.rows,))
 
     def _modes(self, poses):
         return lax.stop_gradient(poses[-self.rows :, 0])
@@ -115,6 +123,10 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
     @property
     def needs(self) -> Literal["wrenches", "multipliers", "normal"]:
         return "normal" if self.in_contact else "wrenches"
+
+    @property
+    def contact_law(self):
+        return Coulomb(self.coefficient, self.static_coefficient)
 
     @property
     def in_contact(self) -> bool:
@@ -175,17 +187,8 @@ class AbstractDryFriction(AbstractOfJoints, AbstractStickSlip):
         closed = kind_of(lax.stop_gradient(poses[self.places[0][-1], 0])) == CLOSED
         return jnp.where(closed, reactions[0], 0.0)
 
-    def limits(self, space: AbstractSpace, poses: Poses, reactions: Float[Array, "1"]) -> Float[Array, "rows"]:
-        """The normal force in a contact, for each direction of slip; linear in the reactions."""
-        return jnp.repeat(self.normal_force(space, poses, reactions)[None], self.rows)
-
     def seen_wrenches(self, space, poses, wrenches):
         return super().seen_wrenches(space, poses, wrenches) if self.needs == "wrenches" else wrenches
-
-    def slip_forces(self, space, poses, slips, reactions):
-        # The direction does not depend on reactions; an iteration solves for these.
-        against = -slip_direction(self._modes(poses), slips)
-        return self.coefficient * self.normal_force(space, poses, reactions) * against
 
     def slips(self, space, poses, velocities):
         at = np.array(self.places[0])
@@ -439,12 +442,8 @@ class ExactFriction(AbstractScalarPart, AbstractStickSlip):
     needs: ClassVar[Literal["nothing"]] = "nothing"
 
     @property
-    def coefficient(self):
-        return self.force
-
-    @property
-    def static_coefficient(self):
-        return self.static_force
+    def contact_law(self):
+        return GivenForce(self.force, self.static_force)
 
     @property
     def joint_name(self):
@@ -456,8 +455,8 @@ class ExactFriction(AbstractScalarPart, AbstractStickSlip):
     def slips(self, space, poses, velocities):
         return self.measured_with_rate(space, poses, velocities)[1]
 
-    def slip_forces(self, space, poses, slips, reactions):
-        return -self.force * slip_direction(self._modes(poses), slips)
+    def normal_force(self, space, poses, reactions):
+        return jnp.zeros_like(self.force)
 
 
 @on_host

@@ -27,6 +27,7 @@ from .base import (
     Quantities,
     ScalarCoordinate,
 )
+from .contact_laws import Capstan
 from .coordinate_parts import shortest, turns
 from .dry_friction import AbstractStickSlip
 from .forces import generalized_force
@@ -456,7 +457,10 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     has_tension: ClassVar[bool] = True
     directions: ClassVar[int] = 1
     needs: ClassVar[Literal["multipliers"]] = "multipliers"
-    static_coefficient: ClassVar[None] = None
+
+    @property
+    def contact_law(self):
+        return Capstan(self.friction)
 
     @property
     def rows(self):
@@ -465,10 +469,6 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     @property
     def joint_name(self):
         return self.name
-
-    @property
-    def coefficient(self):
-        return jnp.ones_like(self.friction)
 
     @property
     def coupled(self):
@@ -543,7 +543,7 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
     def _loads(self, space, poses, multipliers):
         """Of each pulley the direction of slip, zero in stick; the limit of the rise of the tension, and the rise."""
         mean, stuck = unchecked_take(multipliers, self._span(self._places)), -multipliers[self.spans :]
-        share = 2.0 * jnp.tanh(0.5 * self.friction * self._wraps_of_places(space, poses))
+        share = self.contact_law.share(self._wraps_of_places(space, poses))
         modes, shares = kind_of(self._modes(poses)), self._shares_of_means
         slips = jnp.where(jnp.abs(modes) == FORWARD, modes, 0.0)
         # A rope that pushes rubs as much.
@@ -554,9 +554,9 @@ class RopeFriction(AbstractRope, AbstractStickSlip):
             mean = mean + shares @ rise
         return slips, share * mean, rise
 
-    def limits(self, space, poses, multipliers):
+    def normal_force(self, space, poses, reactions):
         """The largest rises of the tension [N], negative where the rope pushes."""
-        return self._loads(space, poses, multipliers)[1]
+        return self._loads(space, poses, reactions)[1]
 
     def tensions(self, space, poses, multipliers):
         """The tension of each side [N], from the multipliers of the spans and of this friction."""

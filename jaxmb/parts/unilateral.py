@@ -25,6 +25,7 @@ from .base import (
     ScalarCoordinate,
     Velocities,
 )
+from .contact_laws import AbstractImpactLaw, Newton, Poisson
 from .coordinate_parts import AbstractScalarPart
 from .forces import over_ground
 from .kinks import clipped
@@ -74,6 +75,11 @@ class AbstractUnilateralConstraint(AbstractInertialConstraint):
     def scalar_coordinates(self, space, parts):
         del space, parts
         return (ScalarCoordinate(f"{self.name}.mode", moves=True),)
+
+    @property
+    def contact_law(self) -> AbstractImpactLaw:
+        """Hook: the law of impact, by default the part's `impact_law`."""
+        return (Poisson if self.impact_law == "poisson" else Newton)(self.restitution)
 
     @abc.abstractmethod
     def gap(self, space: AbstractSpace, poses: Poses) -> Float[Array, ""]:

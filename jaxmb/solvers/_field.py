@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .linear_map import filled
+
 # `(t, y) -> ((y on the manifold, f), other outputs)`, for raveled y; a pytree, so that it can carry parameters.
 Field = Callable[[Any, Float[Array, " n"]], tuple[tuple[Float[Array, " n"], Float[Array, " n"]], PyTree]]
 # `(t, y, f, along) -> (y, f, g)`: a known state, its f, and g along a rate of the state (None: f), with their
@@ -63,11 +65,6 @@ def probed_derivatives(
     return jax.tree.map(lambda x: x[0], both), contradiction
 
 
-def filled(tangent: Array | None, primal: Array) -> Array:
-    """A tangent; zeros instead of None."""
-    return jnp.zeros_like(primal) if tangent is None else tangent
-
-
 @eqx.filter_custom_jvp
 def at_start(
     end: tuple[Array, Array, Array], solution: Solution, t: Any, y: Float[Array, " n"]
@@ -81,7 +78,7 @@ def at_start(
 def _at_start_jvp(primals, tangents):
     _, f, _ = out = at_start(*primals)
     tangents = eqx.filter_jvp(lambda solution, t, y: solution(t, y, f, None), primals[1:], tangents[1:])[1]
-    return out, tuple(map(filled, tangents, out))
+    return out, filled(out, tangents)
 
 
 def linearized(
@@ -97,7 +94,6 @@ def linearized(
 
     def tangents_of(*tangents):
         # A derivative of the linear function leaves out numbers without tangents.
-        out_tangents = eqx.filter_jvp(push, zeros, tangents)[1]
-        return jax.tree.map(filled, out_tangents, out, is_leaf=lambda x: x is None)
+        return filled(out, eqx.filter_jvp(push, zeros, tangents)[1])
 
     return lambda along, dt: tangents_of(along, dt, None, None), lambda y, rate: tangents_of(still, None, y, rate)

@@ -17,7 +17,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._branches import cond_of_any_lane
-from ._field import Derivatives, Field, Solution, derivatives, filled, linearized
+from ._field import Derivatives, Field, Solution, derivatives, linearized
+from .linear_map import filled
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
@@ -172,7 +173,7 @@ def _at_end_jvp(primals, tangents):
     numbers, rest = eqx.partition(step.solution, has_tangent)
     by_numbers, by_state = linearized(lambda x: eqx.combine(x, rest), numbers, step.t, y, f)
     solve = matrix.tangents(inverses, step.a, step.b, step.free, by_state)
-    load = filled(along.past, step.past) + filled(along.a, step.a) * f + filled(along.b, step.b) * g
+    load = filled(step.past, along.past) + filled(step.a, along.a) * f + filled(step.b, along.b) * g
     return out, solve(by_numbers(along.solution, along.t), load)
 
 

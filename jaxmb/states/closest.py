@@ -31,6 +31,7 @@ from ..linalg.inertia import DiagonalInertia
 from ..linalg.jacobian import MassProjector
 from ..linalg.jitted import jitted
 from ..linalg.newton import newton, root, solve_linear
+from ..linalg.pushed import filled
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 
@@ -397,7 +398,7 @@ def _closest_jvp(primals, tangents):
     q, ok = _closest(guess, held, tol)
     at, fixed = guess.with_(q=q), np.array(held.velocities)
     optimum = _optimality(at, guess.q, fixed)
-    dguess = jnp.zeros_like(guess.q) if tangents[0].q is None else tangents[0].q
+    dguess = filled(guess.q, tangents[0].q)
     moved = jnp.where(np.array(held.coordinates), dguess, 0.0)
 
     def equations(at, guess):

@@ -2,31 +2,100 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._types import Coordinates, Scalar
+from .._types import Coordinates
 from ..linalg.pairs import of_pairs
 from ..linalg.sums import unchecked_take, with_entries
 from ..parts.modes import CLOSED, STICK, Modes
 from .sharing import NoSharing
 
 
-class ContactNumbers(NamedTuple):
-    """The numbers of contacts and dry friction.
+class StackedLaws(eqx.Module):
+    """Laws of one kind, see `parts.contact_laws`.
 
-    **Fields:** for each contact, the coefficient of `restitution`, and in `peaks` the kink of a gap that rises and
-    falls again, infinite for other gaps; for each direction of friction, the `coefficient` of slip and the `limit` of
-    stick.
+    **Fields:** the `laws`, stacked, or what their `kernels` take in their place: the methods of a user's laws by name,
+    captured when the scene was compiled.
     """
 
-    restitution: Float[Array, "contacts"]
+    laws: Any
+    kernels: tuple[tuple[str, Callable[..., Any]], ...] = eqx.field(static=True, default=())
+
+    @property
+    def count(self) -> int:
+        return len(jax.tree.leaves(self.laws)[0])
+
+    @property
+    def kind(self) -> Any:
+        """A law, for what it says of its class."""
+        return self.laws.contact_law if self.kernels else self.laws
+
+    def ask(self, name: str, *values: Float[Array, "laws"]) -> Float[Array, "laws"]:
+        """The answers of a method."""
+        method = dict(self.kernels).get(name, lambda law, *values: getattr(law, name)(*values))
+        return jax.vmap(method)(self.laws, *values)
+
+
+class LawTable(eqx.Module):
+    """The laws of all contacts, or of all directions of friction, kind by kind.
+
+    **Fields:** the `kinds`, and the places of their laws among all, their `members`; an array for `none`.
+    """
+
+    kinds: tuple[StackedLaws, ...]
+    members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    none: Float[Array, "0"]
+
+    @classmethod
+    def of(cls, groups: Iterable[StackedLaws], dtype: Any) -> "LawTable":
+        """The laws of some groups, in their order."""
+        kinds: dict[Any, list[tuple[StackedLaws, list[int]]]] = {}
+        first = 0
+        for group in groups:
+            members = list(range(first, first + group.count))
+            kinds.setdefault(jax.tree.structure(group), []).append((group, members))
+            first += group.count
+        joined = lambda *x: x[0] if len(x) == 1 else jnp.concatenate(x)
+        stacked = [jax.tree.map(joined, *(g for g, _ in alike)) for alike in kinds.values()]
+        members = [tuple(k for _, of_group in alike for k in of_group) for alike in kinds.values()]
+        return cls(tuple(stacked), tuple(members), jnp.zeros(0, dtype))
+
+    @property
+    def varies(self) -> bool:
+        """Whether some friction depends on the speed of slip."""
+        return any(stacked.kind.varies for stacked in self.kinds)
+
+    @property
+    def resists(self) -> bool:
+        """Whether some friction has a force without a normal force."""
+        return any(stacked.kind.resists for stacked in self.kinds)
+
+    def ask(self, name: str, *values: Float[Array, "laws"]) -> Float[Array, "laws"]:
+        """The answers of a method of the laws, whose arguments have one value for each law."""
+        if len(self.kinds) < 2:
+            return self.kinds[0].ask(name, *values) if self.kinds else self.none
+        places = [np.array(of_kind) for of_kind in self.members]
+        pieces = [k.ask(name, *(x[at] for x in values)) for k, at in zip(self.kinds, places, strict=True)]
+        return jnp.concatenate(pieces)[np.argsort(np.concatenate(places))]
+
+
+class ContactLaws(NamedTuple):
+    """The laws of contacts and dry friction at a time.
+
+    **Fields:** the laws along the `normal` of each contact, and along the `slip` of each direction of friction;
+    `peaks`: of each contact the kink of a gap that rises and falls again, infinite for other gaps.
+    """
+
+    normal: LawTable
+    slip: LawTable
     peaks: Float[Array, "contacts"]
-    coefficient: Float[Array, "frictions"]
-    limit: Float[Array, "frictions"]
 
 
 class ContactPlace(NamedTuple):
@@ -67,10 +136,10 @@ class ContactSet:
     **Fields:**
 
     - For each law: its name in `names`; the index of its row of A in `rows`; the index of its mode in q in `places`.
-    - For each contact: whether impacts follow Poisson's law, `by_poisson`, or Newton's.
+    - For each contact: the number of the `phases` of its impacts.
     - For each direction of friction: the index of its contact in `contact_of`, -1 in a joint; in `releases`, whether
-        coefficients of slip and stick differ, so that accelerations jump as slip begins; and in `constant`, whether the
-        coefficients are forces, with a normal force of one.
+        accelerations jump as slip begins.
+    - `of_reactions`: whether some friction depends on the reaction of a joint.
     - `pairs`: for friction with two directions, the index of the first among all friction; the second follows.
     - `coupled`: whether the normal forces of friction in joints depend on friction itself, without other constraints.
     - `sharing`: what is added if contacts imply each other when all are closed, see `shared_contacts`.
@@ -79,10 +148,10 @@ class ContactSet:
     names: tuple[str, ...] = ()
     rows: tuple[int, ...] = ()
     places: tuple[int, ...] = ()
-    by_poisson: tuple[bool, ...] = ()
+    phases: tuple[int, ...] = ()
     contact_of: tuple[int, ...] = ()
     releases: tuple[bool, ...] = ()
-    constant: tuple[bool, ...] = ()
+    of_reactions: bool = False
     pairs: tuple[int, ...] = ()
     coupled: bool = False
     sharing: NoSharing = dataclasses.field(default_factory=NoSharing)
@@ -98,7 +167,7 @@ class ContactSet:
     @property
     def n(self) -> int:
         """The number of contacts."""
-        return len(self.by_poisson)
+        return len(self.phases)
 
     @property
     def m(self) -> int:
@@ -122,11 +191,6 @@ class ContactSet:
     def in_joints(self) -> Bool[np.ndarray, "frictions"]:
         """Which directions of friction belong to joints, where the size of the reaction is the normal force."""
         return np.array(self.contact_of, int) < 0
-
-    @functools.cached_property
-    def of_reactions(self) -> bool:
-        """Whether some friction depends on the reaction of a joint."""
-        return bool(np.any(self.in_joints & ~np.array(self.constant, bool)))
 
     @functools.cached_property
     def in_pairs(self) -> Bool[np.ndarray, "frictions"]:
@@ -190,17 +254,3 @@ class ContactSet:
             return at, multipliers
         own = np.eye(multipliers.shape[1])[np.array(self.rows)]
         return at.with_(q=self.bound(at.q)), multipliers + jnp.asarray(own, multipliers.dtype)
-
-    # Friction of constant size, whose normal force is one
-
-    def by_forces(self, reactions: Float[Array, "more_laws m d"]) -> Float[Array, "more_laws m d"]:
-        """The reactions without forces along the laws, and by a unit force along each."""
-        if not any(self.constant):
-            return reactions
-        return reactions.at[1:, np.flatnonzero(self.constant)].set(0.0)
-
-    def with_limits(self, system: Any, t: Scalar, size: Float[Array, ""]) -> Float[Array, ""]:
-        """The largest force, with limits of friction beside which no other force may act."""
-        if not any(self.constant):
-            return size
-        return size + jnp.max(system.contact_numbers(t).limit[np.flatnonzero(self.constant)])

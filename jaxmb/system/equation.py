@@ -24,7 +24,7 @@ from ..linalg.block_jacobian import JointOrder
 from ..linalg.inertia import AbstractInertia
 from ..linalg.jacobian import AbstractJacobian, DenseJacobian
 from ..solvers.manifold_term import AbstractFieldJacobian, GapsSeen
-from .contact_set import ContactNumbers, ContactSet
+from .contact_set import ContactLaws, ContactSet, LawTable
 from .velocity_facts import VelocityFact, is_drift_free, is_linear
 
 if TYPE_CHECKING:
@@ -157,8 +157,8 @@ class AbstractEquation(eqx.Module):
     def force(self, t: Scalar, q: Coordinates, u: Velocities) -> Float[Array, "nu"]:
         """`F(t, q, u)`: applied forces and the bias of inertia."""
 
-    # Internal states z with ż = h(t, q, u, z). Forces depend on z, constraints do not. So the equations above hold as
-    # they are for a system that holds values of its states.
+    # Internal states z with ż = h(t, q, u, z). Forces, laws of contacts and inertia may depend on z, constraints do
+    # not. So the equations above hold as they are for a system that holds values of its states.
 
     @property
     def nz(self) -> int:
@@ -166,7 +166,7 @@ class AbstractEquation(eqx.Module):
         return 0
 
     def with_states(self, z: Float[Array, "nz"]) -> Self:
-        """The same system with values of its internal states, for its forces and `state_rates`."""
+        """The same system with values of its internal states."""
         del z
         return self
 
@@ -282,10 +282,11 @@ class AbstractEquation(eqx.Module):
 
     # Unilateral constraints
 
-    def contact_numbers(self, t: Scalar) -> ContactNumbers:
-        """The numbers of `contacts` at a time; they are parameters, and some may be inputs."""
+    def contact_laws(self, t: Scalar) -> ContactLaws:
+        """The laws of `contacts` at a time; their numbers are parameters, and some may be inputs."""
         del t
-        return ContactNumbers(*[jnp.zeros(0)] * 4)
+        none = LawTable((), (), jnp.zeros(0))
+        return ContactLaws(none, none, none.none)
 
     # Implicit methods
 

@@ -17,7 +17,7 @@ from .._compat import traces_around
 from .._types import Coordinates, Scalar, State, Velocities
 from ..linalg.jacobian import AbstractJacobian
 from ..linalg.sums import placed_sums
-from .contact_set import ContactMotion, ContactPlace
+from .contact_set import ContactLaws, ContactMotion, ContactPlace
 from .equation import AbstractEquation
 
 T = TypeVar("T")
@@ -203,6 +203,11 @@ class Instant(eqx.Module, Keeper):
     def contact_motion(self) -> ContactMotion:
         """Their rates."""
         return self.now.contacts
+
+    @kept
+    def contact_laws(self) -> ContactLaws:
+        """Their laws."""
+        return self.system.contact_laws(self.t)
 
     @property
     def gaps(self) -> Float[Array, "contacts"]:

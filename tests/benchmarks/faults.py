@@ -218,13 +218,13 @@ FAULTS = [
     Fault("parts/dry_friction.py", "return reactions if self.in_gear", "return jnp.abs(reactions) if self.in_gear"),
     Fault(
         "parts/dry_friction.py",
-        "against = -slip_direction(self._modes(poses), slips)",
-        "against = slip_direction(self._modes(poses), slips)",
+        "self.contact_law, -slip_direction(self._modes(poses), slips)",
+        "self.contact_law, slip_direction(self._modes(poses), slips)",
     ),
     Fault(
-        "parts/dry_friction.py",
-        "return jnp.maximum(self.coefficient, self.static_coefficient)",
-        "return self.coefficient",
+        "parts/contact_laws.py",
+        "return law.slip if law.stick is None else jnp.maximum(law.slip, law.stick)",
+        "return law.slip",
     ),
     Fault(
         "parts/dry_friction.py",
@@ -252,7 +252,7 @@ FAULTS = [
         "jnp.where(jnp.dot(lax.stop_gradient(slip), modes) > 0, -1.0, 1.0)",
     ),
     Fault("parts/rope.py", "turned = self._signed(k, xp.arctan2(sine", "turned = self._signed(k, -xp.arctan2(sine"),
-    Fault("parts/rope.py", "share = 2.0 * jnp.tanh(0.5 * self.friction", "share = 2.0 * jnp.tanh(self.friction"),
+    Fault("parts/contact_laws.py", "return 2.0 * jnp.tanh(0.5 * self.friction", "return 2.0 * jnp.tanh(self.friction"),
     Fault(
         "parts/rope.py",
         "unchecked_take(multipliers, self._span_of_side) + self._halves.T @ rise",
@@ -665,8 +665,8 @@ FAULTS = [
     Fault("contacts/events.py", "Event(time + float(rest), name", "Event(time - float(rest), name"),
     Fault(
         "contacts/forces.py",
-        "limit = at.system.contact_numbers(at.t).limit",
-        "limit = at.system.contact_numbers(at.t).coefficient",
+        "coefficient, hold = sticking(at)",
+        "coefficient, hold = slowly_sliding(at)",
     ),
     Fault(
         "contacts/friction.py",
@@ -694,14 +694,14 @@ FAULTS = [
     Fault("contacts/impact.py", "dq + dlate * rates[0], du + dlate", "dq - dlate * rates[0], du + dlate"),
     Fault(
         "contacts/impacting.py",
-        "restitution * jnp.maximum(-when.at[: self.contacts.n], 0.0)",
-        "restitution * jnp.abs(when.at[: self.contacts.n])",
+        "jnp.maximum(-when.at[: self.contacts.n], 0.0)",
+        "jnp.abs(when.at[: self.contacts.n])",
     ),
     Fault("contacts/impacting.py", "closing**2 - 2 * curve[:n] * gap", "closing**2 + 2 * curve[:n] * gap"),
     Fault(
-        "contacts/impacting.py",
-        "again = self.system.contact_numbers(self.at.t).restitution * impulses[: self.contacts.n]",
-        "again = self.system.contact_numbers(self.at.t).restitution**2 * impulses[: self.contacts.n]",
+        "parts/contact_laws.py",
+        "return self.restitution * impulse",
+        "return self.restitution**2 * impulse",
     ),
     Fault("contacts/impacting.py", "2 * rate / (falls * (1 - ratio))", "2 * rate / falls"),
     Fault(
@@ -711,8 +711,8 @@ FAULTS = [
     ),
     Fault(
         "contacts/phases.py",
-        "bounce = frame.here.restitution * jnp.maximum(-rates[: contacts.n], 0.0)",
-        "bounce = jnp.maximum(-rates[: contacts.n], 0.0)",
+        'frame.here.laws.ask("rebound", closing)',
+        "closing",
     ),
     # Formulations
     Fault("formulations/friction.py", "return jnp.all((y > 0) & jnp.isfinite(y))", "return jnp.all(jnp.isfinite(y))"),
@@ -853,7 +853,7 @@ FAULTS = [
     Fault("solvers/_dense.py", "- self.acceleration @ change\n", "+ self.acceleration @ change\n"),
     Fault("solvers/_formulas.py", "slope = means / values - curvature", "slope = means / values + curvature"),
     Fault(
-        "solvers/_newton.py", "filled(along.a, step.a) * f + filled(along.b, step.b) * g", "filled(along.a, step.a) * f"
+        "solvers/_newton.py", "filled(step.a, along.a) * f + filled(step.b, along.b) * g", "filled(step.a, along.a) * f"
     ),
     Fault(
         "solvers/_stiffness.py",

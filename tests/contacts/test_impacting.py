@@ -50,7 +50,7 @@ def pieces():
         struck = start.struck._replace(rate=jnp.array([-0.5]) * rise)
         at = start._replace(when=start.when._replace(touching=jnp.array([True])), struck=struck)
         when = event.at_event(udot, curve)
-        return when, event.low_bounces(at, jnp.array([-G]), True), event.bounces(when)
+        return when, event.low_bounces(at, jnp.array([-G]), True), event.closing(when)
 
     return found
 
@@ -59,12 +59,12 @@ def test_time_of_an_event_is_that_of_a_parabola():
     """A gap that is far does not close here, and one that opens does not bounce."""
     height = 50 * TOUCH
     for rise, hits in ((-1.0, True), (1.0, False)):
-        when, _, bounce = pieces()(height, rise)
+        when, _, closing = pieces()(height, rise)
         late = (rise + np.sqrt(rise**2 + 2 * G * height)) / G if hits else 0.0
         assert when.hits == hits and when.touching == hits
         np.testing.assert_allclose(when.late, late, rtol=1e-12)
         np.testing.assert_allclose(when.at, rise - G * late, rtol=1e-12)
-        np.testing.assert_allclose(bounce, 0.5 * (G * late - rise) if hits else 0.0, rtol=1e-12)
+        np.testing.assert_allclose(closing, G * late - rise if hits else 0.0, rtol=1e-12)
     assert not pieces()(200 * TOUCH, -1.0)[0].hits
 
 

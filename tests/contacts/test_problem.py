@@ -2,11 +2,14 @@
 
 import functools
 import itertools
+import types
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmb.contacts.forces import Limits
 from jaxmb.contacts.problem import Laws
 from jaxmb.parts.modes import FREE, STICK
 from jaxmb.system.contact_set import ContactSet
@@ -22,10 +25,15 @@ def found():
     def answers(mode, load):
         one, none = jnp.ones(1), jnp.zeros(0)
         joint = ContactSet(names=("rub",), rows=(0,), places=(0,), contact_of=(-1,), releases=(False,))
-        laws = Laws(jnp.eye(1), joint, COEFFICIENT * one, COEFFICIENT * one)
+        constant = types.SimpleNamespace(slip=types.SimpleNamespace(varies=False))
+        at: Any = types.SimpleNamespace(system=types.SimpleNamespace(contacts=joint), contact_laws=constant)
+        limits = Limits(COEFFICIENT * one, None)
+        laws = Laws(at, jnp.eye(1), limits, limits)
         reactions = jnp.array([[[0.0, NORMAL]], [[0.0, 0.0]]])
         opening = load * COEFFICIENT * NORMAL * one
-        return laws.answers(laws.of_forces(opening, reactions, none > 0, 0 * one, joint.as_modes(mode * one), 0 * one))
+        rest = 0 * one
+        problem = laws.of_forces(opening, reactions, none > 0, rest, rest, joint.as_modes(mode * one), rest)
+        return laws.answers(problem)
 
     return answers
 

@@ -112,7 +112,7 @@ def test_gap_and_its_derivatives(name):
     text = str(system.describe())
     assert "contacts" in text and "where closed 1 row each" in text
     assert "c.mode" in system.coordinate_names() and "c.restitution" in mb.parameters(system)
-    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_numbers(0.0).restitution == 0.5
+    assert mb.with_parameters(system, {"c.restitution": 0.5}).contact_laws(0.0).normal.ask("ratio", jnp.ones(1)) == 0.5
 
 
 @pytest.mark.slow

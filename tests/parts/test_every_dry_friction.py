@@ -129,10 +129,11 @@ def test_words_and_numbers():
     assert "rub.mode" in system.coordinate_names()
     assert {"rub.coefficient", "rub.static_coefficient", "rub.radius"} <= set(mb.parameters(system))
     changed = mb.with_parameters(system, {"rub.coefficient": 0.1, "rub.static_coefficient": 0.2})
-    assert changed.contact_numbers(0.0).coefficient == 0.1 and changed.contact_numbers(0.0).limit == 0.2
+    law = changed.contact_laws(0.0).slip
+    assert law.ask("coefficient", jnp.zeros(1)) == 0.1 and law.ask("limit") == 0.2
     # Without a coefficient of stick that of slip holds.
     changed = mb.with_parameters(friction_scene("slide"), {"rub.coefficient": 0.1})
-    assert changed.contact_numbers(0.0).limit == 0.1
+    assert changed.contact_laws(0.0).slip.ask("limit") == 0.1
 
 
 BODY = planar.Body("a", mass=1.0, inertia=1.0)

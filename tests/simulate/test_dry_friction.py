@@ -90,14 +90,14 @@ def test_coefficients_and_forces_follow_their_inputs():
     brake = mb.Series([0.0, 1.0], [0.2, 0.6], "linear")
     for static, limit in ((None, [0.3, 0.5]), (0.4, [0.4, 0.5])):
         system = mb.with_inputs(slider(coefficient=0.3, static_coefficient=static), {"rub.coefficient": brake})
-        numbers = [system.contact_numbers(t) for t in (0.25, 0.75)]
-        np.testing.assert_allclose([x.coefficient[0] for x in numbers], [0.3, 0.5])
-        np.testing.assert_allclose([x.limit[0] for x in numbers], limit)
-    numbers = [mb.with_inputs(clamped(), {"rub.force": brake}).contact_numbers(t) for t in (0.25, 0.75)]
-    np.testing.assert_allclose([x.coefficient[0] for x in numbers], [0.3, 0.5])
-    np.testing.assert_allclose([x.limit[0] for x in numbers], [0.3, 0.5])
+        laws = [system.contact_laws(t).slip for t in (0.25, 0.75)]
+        np.testing.assert_allclose([x.ask("coefficient", jnp.zeros(1))[0] for x in laws], [0.3, 0.5])
+        np.testing.assert_allclose([x.ask("limit")[0] for x in laws], limit)
+    laws = [mb.with_inputs(clamped(), {"rub.force": brake}).contact_laws(t).slip for t in (0.25, 0.75)]
+    np.testing.assert_allclose([x.ask("resistance", jnp.zeros(1))[0] for x in laws], [0.3, 0.5])
+    np.testing.assert_allclose([x.ask("hold")[0] for x in laws], [0.3, 0.5])
     # Without a static force the force of slip holds in stick too.
-    assert mb.with_parameters(clamped(), {"rub.force": 0.5}).contact_numbers(0.0).limit == 0.5
+    assert mb.with_parameters(clamped(), {"rub.force": 0.5}).contact_laws(0.0).slip.ask("hold") == 0.5
     ball = planar.PointMass("ball", mass=1.0, position=(0.0, 0.1))
     floor = mb.RigidContact("floor", "ball", terrain=FLAT, restitution=0.5)
     with pytest.raises(ValueError, match=r"'floor\.restitution' must be constant: .*restitution.*with_parameters"):

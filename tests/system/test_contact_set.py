@@ -31,7 +31,8 @@ def scene(contacts=True):
 
 def test_contact_set_has_the_laws_of_contacts_and_friction():
     system = scene()
-    contacts, numbers = system.contacts, system.contact_numbers(0.0)
+    contacts, laws = system.contacts, system.contact_laws(0.0)
+    slip, stick = laws.slip.ask("coefficient", jnp.zeros(3)), laws.slip.ask("limit")
     assert contacts and contacts == system.contacts
     assert (contacts.n, contacts.m) == (1, 3)
     assert contacts.contact_names == ("floor",) and sorted(contacts.friction_names) == ["brake", "rub"]
@@ -47,8 +48,11 @@ def test_contact_set_has_the_laws_of_contacts_and_friction():
         assert contacts.contact_of[k] == (0 if name == "rub" else -1)
         assert contacts.in_joints[k] == (name == "brake") and contacts.in_pairs[k] == (name == "rub")
         assert contacts.releases[k] == (name == "brake")
-        assert (numbers.coefficient[k], numbers.limit[k]) == ((0.2, 0.2) if name == "rub" else (0.3, 0.4))
-    assert contacts.by_poisson == (True,) and numbers.restitution == 0.5 and np.all(np.isinf(numbers.peaks))
+        assert (slip[k], stick[k]) == ((0.2, 0.2) if name == "rub" else (0.3, 0.4))
+    assert contacts.phases == (2,) and np.all(np.isinf(laws.peaks))
+    # By Poisson's law a contact pushes again, and need not open before.
+    ask = lambda name, *values: laws.normal.ask(name, *(jnp.full(1, x) for x in values))
+    assert (ask("ratio", 4.0), ask("rebound", 4.0), ask("pushed", 8.0, 4.0)) == (0.5, 0.0, 4.0)
 
 
 def test_contact_set_binds_all_that_is_closed():
@@ -84,4 +88,5 @@ def test_contact_set_of_a_system_without_contacts():
     assert not contacts and (contacts.n, contacts.m) == (0, 0)
     assert Instant(system, 0.0, q, np.zeros(system.nu)).gaps.size == contacts.modes(q).open.size == 0
     np.testing.assert_array_equal(contacts.bound(q), q)
-    assert all(x.size == 0 for x in system.contact_numbers(0.0))
+    laws, none = system.contact_laws(0.0), np.zeros(0)
+    assert laws.normal.ask("ratio", none).size == laws.slip.ask("limit").size == laws.peaks.size == 0
