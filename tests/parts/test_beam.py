@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 from oracles.beams import tip
 
@@ -660,3 +661,53 @@ def test_free_flight_keeps_energy_and_momentum(inextensible):
     masses = np.array([body.mass for body in own.bodies])
     momenta = sum(m * np.asarray(motion[body.name].velocity) for m, body in zip(masses, own.bodies, strict=True))
     np.testing.assert_allclose(momenta - momenta[0], 0.0, atol=1e-9)
+
+
+def right_angle(n):
+    """A right angle of two legs of n inextensible beams, clamped at one end, with the published numbers. A force at the
+    elbow rises to 50 in the first second and falls to zero in the next (J. C. Simo, L. Vu-Quoc, Comput.
+    Methods Appl. Mech. Engrg. 66(2), 1988).
+    """
+    stiff = {"axial_stiffness": 1e6, "shear_stiffness": 1e6}
+    section = sections.Section(bending_stiffness=1e3, torsional_stiffness=1e3, **stiff)
+    corner = (10.0, 0.0, 0.0)
+    chain = functools.partial(spatial.beam_chain, section=section, mass=10.0, inextensible=True)
+    legs = [
+        chain("a", np.linspace((0.0, 0.0, 0.0), corner, n + 1)),
+        chain("b", np.linspace(corner, (10.0, 10.0, 0.0), n + 1), ends=(f"a_node{n}", None)),
+    ]
+    length = 10.0 / n
+
+    def with_inertia(body):
+        # The rest of a half beam is about the node, which is at its end.
+        share = body.mass / length
+        turned = body.mass * length**2 / 12 * np.array([0.0, 1.0, 1.0])
+        return body.with_fields(inertia=np.diag(share * length * np.array([20.0, 10.0, 10.0]) + turned))
+
+    bodies = [with_inertia(body) for leg in legs for body in leg.bodies]
+    load = spatial.PointForce("load", f"a_node{n}", force=(0.0, 0.0, 0.0))
+    scene = mb.Scene(bodies, joints=[part for leg in legs for part in leg.joints], forces=[load])
+    return mb.with_inputs(scene.compile(), {"load.force": right_angle_force})
+
+
+def right_angle_force(t):
+    return jnp.array([0.0, 0.0, 50.0]) * jnp.maximum(0.0, 1.0 - jnp.abs(t - 1.0))
+
+
+@pytest.mark.slow
+def test_right_angle_sways():
+    """With 16 beams within 2 % of the limit; the energy after the load is the work of the load."""
+    times, swings = np.concatenate([np.linspace(0.0, 2.0, 401), np.linspace(2.0, 30.0, 561)[1:]]), []
+    for n in (4, 8):
+        system = right_angle(n)
+        motion = mb.simulate(system, mb.assemble(system), t1=30.0, rtol=1e-6, atol=1e-7, jumps=[1.0, 2.0], saveat=times)
+        force = np.asarray(jax.vmap(right_angle_force)(times[:401]))[:, 2]
+        power = force * np.asarray(motion[f"a_node{n}"].velocity)[:401, 2]
+        np.testing.assert_allclose(
+            motion.energy[400:] - motion.energy[0], scipy.integrate.simpson(power, x=times[:401]), rtol=1e-5
+        )
+        ends = [np.asarray(motion[name].position)[:, 2] for name in (f"a_node{n}", f"b_node{n}")]
+        swings.append([extreme(z) for z in ends for extreme in (np.max, np.min)])
+    limit = extrapolated(np.array(swings))
+    assert np.all(np.abs(limit) > 4.0)
+    np.testing.assert_allclose(swings[1], limit, rtol=0.02)
