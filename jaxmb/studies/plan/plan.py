@@ -89,11 +89,12 @@ def plan(
 
     - `intervals`: their number, or the nodes as ascending shares of the duration from 0 to 1.
     - `interpolation` of controls: `"held"`, constant on each interval; `"linear"`; `"cubic"`, with continuous rates.
+        Their bounds hold between nodes, too.
     - `moving`: whether nodes then move to where controls jump; the others stay evenly between them. For least time,
         with `"held"`.
     - `guess`: values or functions of time by name, of coordinates, controls, designed parameters and `"duration"`; or a
-        `Trajectory`; or another `Plan`. By default coordinates go straight from start to end, and controls have the
-        values of the system.
+        `Trajectory`; or `required_forces` of a motion by the names of controls, which are then feasible; or another
+        `Plan`. By default coordinates go straight from start to end, and controls have the values of the system.
     - `t0` [s]: the time of the start.
     - `method`: `"ipopt"`, with exact derivatives (the default if `ipyopt` is installed, by the extra `plan`); or
         `"slsqp"` of SciPy for small plans.
