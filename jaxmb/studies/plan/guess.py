@@ -62,7 +62,7 @@ def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
         states, angles = _along(task, system, motion, ts)
     states = with_turns(system, ts, states, angles)
     if states.angles is not None:
-        states = State(states.q, states.u, states.z, np.unwrap(states.angles, axis=0))
+        states = State(states.q, states.u, states.z, jnp.asarray(np.unwrap(states.angles, axis=0)))
     return Guess(states, ts, controls, design)
 
 

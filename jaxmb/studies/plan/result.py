@@ -280,11 +280,9 @@ def judged(plan: Plan) -> Plan:
     contacts = plan.system.contacts
     if not plan.success or not (contacts.contact_names or contacts.friction_names):
         return plan
-    events = list(plan.trajectory.events)
-    changes = [event for event in events if event.time > plan.ts[0]]
-    if plan.arrival > _ARRIVES:
-        # Friction at the start may have another mode than the state.
-        changes = events
+    events = plan.trajectory.events
+    # Friction at the start may have another mode than the state, with another motion.
+    changes = [*(events.at_start if plan.arrival > _ARRIVES else ()), *events]
     if not changes:
         return plan
     first = changes[0]

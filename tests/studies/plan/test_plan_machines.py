@@ -1,6 +1,7 @@
 """Optimal control of machines against exact optima, Pontryagin's equations, and simulations by another method."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -130,7 +131,8 @@ def stewart():
         for own, radius, height in zip(angles, (1.0, 0.6), (0.0, 1.0), strict=True)
     )
     bodies = [spatial.Body("platform", mass=20.0, inertia=(1.5, 1.5, 3.0), position=(0.0, 0.0, 1.0))]
-    joints, forces = [], [mb.Gravity((0.0, 0.0, -9.81))]
+    joints: list[Any] = []
+    forces: list[Any] = [mb.Gravity((0.0, 0.0, -9.81))]
     for k, (foot, head) in enumerate(zip(feet, heads, strict=True)):
         along = (head - foot) / np.linalg.norm(head - foot)
         across = np.cross(along, [0.0, 0.0, 1.0])

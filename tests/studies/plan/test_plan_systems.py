@@ -146,6 +146,15 @@ def test_plan_knows_forces_of_time():
     np.testing.assert_allclose(force, line[0] + line[1] * (plan.ts - 1.0), rtol=0, atol=1e-6)
 
 
+def test_plan_takes_variables_of_a_design(system):
+    """The effort is 12 m², with the mass m as the third power of the size."""
+    size = {"size": mb.Variable(1.0, bounds=(0.8, 1.2), unit="m")}
+    machine, free = mb.design(system, size, lambda v: {"slider.mass": v["size"] ** 3}), {"push.force": None}
+    smaller = moved(machine, free, design={"size": (0.8, 1.2)}, intervals=2)
+    assert smaller.success and smaller.objective == pytest.approx(12 * 0.8**6, rel=1e-6)
+    assert moved(machine, free, intervals=2).derivatives("size")["size"] == pytest.approx(72.0, rel=1e-8)
+
+
 def test_plan_names_dry_friction_that_changes():
     """At rest friction sticks; from a state of slip on, the force is linear in time, and works against friction."""
     system = sliding(mb.JointFriction("rub", "rail.displacement", force=0.5, exact=True))
