@@ -190,7 +190,9 @@ def carried(before: AbstractSystem, state: State, system: AbstractSystem, t: Sca
     for name in coordinates:
         if name not in known:
             raise unknown("coordinate", name, known, "plan_phases: a phase begins where the last ended")
-    return _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
+    begin = _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
+    same = before.wrapped_angle_names() == system.wrapped_angle_names()
+    return State(begin.q, begin.u, begin.z, state.angles if same else begin.angles)
 
 
 def _first(system: AbstractSystem, given: State | Limits, t: Scalar, near: State | None) -> State | None:

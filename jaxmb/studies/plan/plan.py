@@ -72,11 +72,12 @@ def plan(
     **Arguments:**
 
     - `controls`: bounds `(low, high)` of parameters that become functions of time, either of them None, or None
-        without bounds; parameters as of `with_inputs`. `{}` with a `design` alone.
+        without bounds; parameters of forces as of `with_inputs`. `{}` with a `design` alone.
     - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
     - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
         high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. Others are free.
-        For vectors of two components `(x, y)` is the value, and `((x, y), (x, y))` are bounds.
+        For vectors of two components `(x, y)` is the value, and `((x, y), (x, y))` are bounds. Angles of joints in
+        space count turns from the start on, as in a motion.
     - `running`: a function of the instant by names, `lambda at: at["motor.force"] ** 2`; or `"effort"`, the sum of the
         squares of the controls.
     - `final`: a function of the end, `lambda at: -at["tip.position"][0]`; or `"time"`, the duration.
