@@ -17,7 +17,6 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
 from ..evaluate import evaluate
-from ..inverse.required import RequiredForces
 from .lanes import in_lanes
 from .task import Limits, Task
 
@@ -112,13 +111,14 @@ def _controls(task, named, motion, ts):
 
 
 def _known_controls(task: Task, motion: Any) -> Mapping[str, Series]:
-    """The controls of a motion as functions of its time."""
-    if not isinstance(motion, RequiredForces):
+    """The controls of a motion as functions of its time: of another plan, or required forces."""
+    forces = getattr(motion, "forces", None)
+    if not isinstance(forces, Mapping):
         return getattr(motion, "controls", {})
-    for name in motion.forces:
+    for name in forces:
         if name not in (control.name for control in task.controls):
             raise unknown("control", name, [c.name for c in task.controls], "plan: guess, required_forces(…, by=)")
-    return {name: Series(motion.ts, force, "linear") for name, force in motion.forces.items()}
+    return {name: Series(motion.ts, force, "linear") for name, force in forces.items()}
 
 
 def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None) -> Any:

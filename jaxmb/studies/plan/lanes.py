@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -96,8 +96,12 @@ def by_name(shapes: Iterable[tuple[str, tuple[int, ...]]], numbers: Any) -> dict
 
 
 class AbstractLane(eqx.Module):
-    """A function of the inputs of one interval or node, near the state where its chart was made."""
+    """A function of the inputs of one interval or node, near the state where its chart was made.
 
+    `integrates`: whether it does, so that it has `slope`, and its differences take long.
+    """
+
+    integrates: ClassVar[bool] = False
     model: eqx.AbstractVar[Model]
 
     @abc.abstractmethod
@@ -114,6 +118,7 @@ class Arrival(AbstractLane):
     the border of a chart all are NaN.
     """
 
+    integrates = True
     model: Model
     running: Callable[[Reading], Any] | None = eqx.field(static=True)
 
@@ -320,7 +325,7 @@ class Block:
         differences are.
         """
         active = np.array(self.active, int)
-        if isinstance(self.lane, Arrival) and active.size >= _MANY:
+        if self.lane.integrates and active.size >= _MANY:
             room = next(room for room in (_FEW_STEPS, MOST_STEPS) if self.steps <= room)
             shared = self.lane, np.asarray(self.steps), room, self.active
             return in_lanes(_bends, shared, self.charts, inputs, weights)

@@ -10,7 +10,10 @@ from scipy import integrate, optimize
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.studies.plan import solvers
+from jaxmb.studies.plan import lanes, solvers
+from jaxmb.studies.plan.guess import first_guess
+from jaxmb.studies.plan.plan import task_of
+from jaxmb.studies.plan.transcription import Transcription
 
 MOST_PROGRAMS = 120
 PUSHED = {"push.force": (-5.0, 5.0)}
@@ -66,6 +69,35 @@ def test_sensitivities_at_active_bounds_are_differences_of_optima(system):
     np.testing.assert_allclose(found.controls["push.force"], slopes, rtol=0, atol=2e-3)
 
 
+def test_exact_second_derivatives_of_an_interval_are_differences_of_first_derivatives(monkeypatch):
+    """Of two and of three steps, with a swinging load and a running cost."""
+    load = planar.Body("load", mass=1.0, inertia=0.1, position=(0.3, -0.4))
+    hook = planar.Revolute("hook", "slider", "load", point=(0.0, 0.0))
+    slider = planar.Body("slider", mass=1.0, inertia=1.0)
+    rail = planar.Prismatic("rail", "ground", "slider", point=(0.0, 0.0), axis=(1.0, 0.0))
+    forces = [mb.JointForce("push", "rail.displacement", force=0.0), mb.Gravity((0.0, -9.81))]
+    swinging = mb.Scene([slider, load], joints=[rail, hook], forces=forces).compile()
+    free = mb.assemble(swinging)
+    running = lambda at: at["push.force"] ** 2 * at["load.x"]
+    options = {"duration": (0.5, 2.0), "objective": (running, None), "nodes": (2, "cubic"), "ends": (free, {})}
+    task = task_of(swinging, controls={"push.force": None}, **options)
+    made = Transcription.of(task, first_guess(task, {"push.force": lambda t: 3.0 - t}), 2)
+    block, random = made.problem.terms[0].block, np.random.default_rng(0)
+    inputs = made.problem.terms[0].at(made.start)
+    inputs += 0.1 * random.standard_normal(inputs.shape)
+    for block.steps in (2, 3):
+        outputs, first = block.linearised(inputs)
+        weights = random.standard_normal(outputs.shape)
+        scales = np.ones(inputs.shape)
+        differences = block.curvature(inputs, first, weights, scales, central=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(lanes, "_MANY", 1)
+            exact = block.curvature(inputs, first, weights, scales)
+        assert np.max(np.abs(exact)) > 0.1
+        np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-7)
+
+
 def test_required_forces_of_a_motion_are_a_feasible_guess():
     bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
@@ -100,7 +132,7 @@ def hinged():
 def test_angle_in_space_at_the_end_counts_turns(hinged, angle):
     """The torque is linear in time, ∫ τ² dt = 12 J² φ² / T³."""
     start, end = ({"axle.angle": x, "axle.angle_rate": 0.0} for x in (0.0, angle))
-    options = {"duration": 2.0, "running": "effort", "intervals": 6, "path": {"axle.angle": (-9.0, 9.0)}}
+    options = {"duration": 2.0, "running": "effort", "intervals": 12, "path": {"axle.angle": (-9.0, 9.0)}}
     plan = mb.plan(hinged, controls={"motor.force": None}, start=start, end=end, **options)
     assert plan.success and plan.objective == pytest.approx(12 * 0.52**2 * angle**2 / 8, rel=1e-8)
     assert plan.violation == {"axle.angle": 0.0}
@@ -111,7 +143,7 @@ def test_periodic_plan_in_space_ends_after_a_turn(hinged):
     """Against gravity, a free turn in the same time needs no torque; Euler parameters have the other sign then."""
     system = mb.with_parameters(hinged, {"gravity.acceleration": (0.0, -9.81, 0.0)})
     turn = {"axle.angle": lambda t: np.pi * t}
-    options = {"duration": 2.0, "running": "effort", "periodic": True, "intervals": 8}
+    options = {"duration": 2.0, "running": "effort", "periodic": True, "intervals": 16}
     plan = mb.plan(system, controls={"motor.force": None}, start={"axle.angle": 0.0}, guess=turn, **options)
     assert plan.success and plan.objective < 1e-8
     np.testing.assert_allclose(plan.states.u[-1], plan.states.u[0], rtol=0, atol=1e-7)
