@@ -17,6 +17,7 @@ from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
 from ..evaluate import evaluate
+from ..inverse.required import RequiredForces
 from .lanes import in_lanes
 from .task import Limits, Task
 
@@ -112,13 +113,13 @@ def _controls(task, named, motion, ts):
 
 def _known_controls(task: Task, motion: Any) -> Mapping[str, Series]:
     """The controls of a motion as functions of its time: of another plan, or required forces."""
-    forces = getattr(motion, "forces", None)
-    if not isinstance(forces, Mapping):
+    # A concrete class: a trajectory has forces, too, of its force elements.
+    if not isinstance(motion, RequiredForces):
         return getattr(motion, "controls", {})
-    for name in forces:
+    for name in motion.forces:
         if name not in (control.name for control in task.controls):
             raise unknown("control", name, [c.name for c in task.controls], "plan: guess, required_forces(…, by=)")
-    return {name: Series(motion.ts, force, "linear") for name, force in forces.items()}
+    return {name: Series(motion.ts, force, "linear") for name, force in motion.forces.items()}
 
 
 def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None) -> Any:
