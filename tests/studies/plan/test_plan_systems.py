@@ -98,6 +98,7 @@ def test_exact_second_derivatives_of_an_interval_are_differences_of_first_deriva
         np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_required_forces_of_a_motion_are_a_feasible_guess():
     bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
@@ -128,6 +129,7 @@ def hinged():
     return mb.Scene([disc], joints=[axle], forces=forces).compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [np.pi, 3.5])
 def test_angle_in_space_at_the_end_counts_turns(hinged, angle):
     """The torque is linear in time, ∫ τ² dt = 12 J² φ² / T³."""
@@ -139,6 +141,7 @@ def test_angle_in_space_at_the_end_counts_turns(hinged, angle):
     np.testing.assert_allclose(plan.trajectory.quantity("axle.angle")[-1], angle, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_periodic_plan_in_space_ends_after_a_turn(hinged):
     """Against gravity, a free turn in the same time needs no torque; Euler parameters have the other sign then."""
     system = mb.with_parameters(hinged, {"gravity.acceleration": (0.0, -9.81, 0.0)})
@@ -150,6 +153,7 @@ def test_periodic_plan_in_space_ends_after_a_turn(hinged):
     np.testing.assert_allclose(plan.trajectory.quantity("axle.angle")[-1], 2 * np.pi, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_plan_of_a_lagrangian_system():
     system = mb.lagrangian.LagrangianSystem(
         lambda t, q, v, p: 0.5 * v[0] ** 2,
@@ -164,6 +168,7 @@ def test_plan_of_a_lagrangian_system():
     assert plan.success and plan.objective == pytest.approx(12.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_plan_knows_forces_of_time():
     """A wind w(t); the best force is linear in time."""
     system = sliding(mb.JointForce("wind", "rail.displacement", force=0.0))
@@ -178,6 +183,7 @@ def test_plan_knows_forces_of_time():
     np.testing.assert_allclose(force, line[0] + line[1] * (plan.ts - 1.0), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_plan_takes_variables_of_a_design(system):
     """The effort is 12 m², with the mass m as the third power of the size."""
     size = {"size": mb.Variable(1.0, bounds=(0.8, 1.2), unit="m")}
@@ -187,6 +193,7 @@ def test_plan_takes_variables_of_a_design(system):
     assert moved(machine, free, intervals=2).derivatives("size")["size"] == pytest.approx(72.0, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_plan_names_dry_friction_that_changes():
     """At rest friction sticks; from a state of slip on, the force is linear in time, and works against friction."""
     system = sliding(mb.JointFriction("rub", "rail.displacement", force=0.5, exact=True))
