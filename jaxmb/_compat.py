@@ -43,9 +43,8 @@ T = TypeVar("T")
 # JAX
 
 
-# Rules of functions in a batch: a given rule, and one member after the other. (jax.custom_batching, 0.7 to 0.10.)
+# A rule of a function in a batch. Derivatives call it without a batch as well. (jax.custom_batching, 0.7 to 0.10.)
 custom_vmap = jax.custom_batching.custom_vmap
-sequential_vmap = jax.custom_batching.sequential_vmap
 
 # The parts of traced programs. (jax.extend.core, 0.7 to 0.10; jax 0.11 changes the parameters of `scan`.)
 ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
@@ -228,6 +227,17 @@ def is_weakly_typed(array: Array) -> bool:
     (`aval.weak_type` of arrays and tracers, jax 0.7 to 0.10.)
     """
     return array.aval.weak_type
+
+
+def sequential_vmap(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """The function of an array, which computes the members of a batch one after the other."""
+    alone = custom_vmap(function)
+
+    @alone.def_vmap
+    def of_members(_, batched, members):
+        return (jax.lax.map(function, members), True) if batched[0] else (function(members), False)
+
+    return alone
 
 
 def define_bilinear(

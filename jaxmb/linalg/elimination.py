@@ -224,7 +224,9 @@ def _sweep_rotating(B):
 @_sweep_rotating.def_vmap
 def _sweep_rotating_batch(size, batched, B):
     # With the batch along the last axis, every operation is one long vector operation instead of many short loops.
-    del size, batched
+    del size
+    if not batched[0]:
+        return _rotate(B), False
     return jnp.moveaxis(_rotate(jnp.moveaxis(B, 0, -1)), -1, 0), True
 
 

@@ -139,6 +139,20 @@ def test_gauss_jordan_values_and_derivatives():
     np.testing.assert_allclose(forward, (values[0] - values[1]) / 2e-5, rtol=1e-6)
 
 
+@pytest.mark.parametrize("size", [5, 41])
+def test_gauss_jordan_in_a_loop_has_derivatives_of_its_gradient(size):
+    """Side by side, by a number that the first derivatives of all members share."""
+    matrix, change = np.eye(size) + 0.1 * RNG.normal(size=(2, size, size)) / size
+
+    def looped(x):
+        step = lambda _, x: x + 0.1 * jnp.sum(gauss_jordan(matrix + jnp.sum(x) * change, size))
+        return jnp.sum(jax.lax.fori_loop(0, 2, step, x))
+
+    x = np.array([0.1, 0.2])
+    both = jax.jit(lambda x: (jax.jacfwd(jax.grad(looped))(x), jax.jacfwd(jax.jacfwd(looped))(x)))
+    np.testing.assert_allclose(*both(x), rtol=1e-9)
+
+
 def test_solve_of_any_regular_matrix():
     """With zeros on the diagonal, so that rows have to be chosen, and one by one in a batch."""
     equations = []

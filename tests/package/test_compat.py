@@ -41,7 +41,7 @@ def test_members_of_a_batch_can_be_taken_one_after_the_other(compat):
 
     x = jnp.arange(6.0).reshape(3, 2)
     np.testing.assert_array_equal(jax.vmap(double)(x), 2 * x)
-    assert set(shapes) == {(2,)}, "sequential_vmap of jax.custom_batching hands whole batches to the function"
+    assert set(shapes) == {(2,)}, "rules of jax.custom_batching hand whole batches to the function"
 
 
 def test_functions_can_have_rules_for_batches(compat):

@@ -141,6 +141,7 @@ CONCRETE = {
     "solvers.whole_steps: WithTangents",
     "studies.inverse.required: Trajectory",
     "studies.lqr.lqr: Plan",
+    "studies.plan.guess: RequiredForces",
     "studies.sweep.cases: Cases",
     "system.design: Variable",
     "viz.scene: Scene",

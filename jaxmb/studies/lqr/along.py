@@ -50,7 +50,7 @@ _PARTS, _RTOL, _STEPS = 4, 1e-9, 2000
 
 
 class _Course(NamedTuple):
-    """A control on one interval: the `numbers` of its course, the `start` and the length `h` [s]."""
+    """A control on one interval: the weighted `numbers` of its course, the `start` and the length `h` [s]."""
 
     numbers: tuple[Any, ...]
     start: Any
@@ -72,7 +72,7 @@ class _Model(eqx.Module):
         pieces = {}
         for control, numbers in zip(self.controls, course.numbers, strict=True):
             own = numbers.reshape(control.course.local, *control.shape)
-            powers = control.course.powers(own, course.h)
+            powers = control.course.powers(own)
             for change, (name, place) in zip(changes, self.chosen, strict=False):
                 if name == control.name:
                     powers[0] = jnp.ravel(powers[0]).at[place].add(change).reshape(control.shape)
@@ -218,7 +218,9 @@ def _courses(plan: Plan) -> _Course:
     """The controls of all intervals, stacked along axis 0."""
     task, found = plan.solution.transcription.task, plan.solution.found
     numbers = tuple(
-        x.reshape(-1, *control.shape)[control.course.places(task.intervals)].reshape(task.intervals, -1)
+        (control.course.weights(task.shares)[:, :, None] * x[control.course.places(task.intervals)]).reshape(
+            task.intervals, -1
+        )
         for control, x in zip(task.controls, found.controls, strict=True)
     )
     return _Course(numbers, plan.ts[:-1], np.diff(plan.ts))

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._types import Scalar
 from ...parts.series import AbstractSignal, Series
 
 
@@ -29,8 +28,12 @@ class AbstractCourse(eqx.Module):
         """The places of each interval's numbers among all, shape (intervals, local)."""
 
     @abc.abstractmethod
-    def powers(self, numbers: Float[Array, "local *shape"], h: Scalar) -> list[Array]:
-        """The coefficients of powers of the share of the interval, 0 to 1, from the numbers and the length h [s]."""
+    def powers(self, numbers: Float[Array, "local *shape"]) -> list[Array]:
+        """The coefficients of powers of the share of the interval, 0 to 1, from its weighted numbers."""
+
+    def weights(self, shares: np.ndarray) -> np.ndarray:
+        """The weights of each interval's numbers, shape (intervals, local), for nodes at shares of the duration."""
+        return np.ones((shares.size - 1, self.local))
 
     def values(self, intervals: int) -> np.ndarray:
         """The places of the values at the nodes, shape (intervals + 1,)."""
@@ -47,7 +50,7 @@ class AbstractCourse(eqx.Module):
 
     @abc.abstractmethod
     def numbers(self, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-        """All numbers, from values and rates at nodes."""
+        """All numbers, from values and rates at nodes, by the share of the duration."""
 
 
 class Held(AbstractCourse):
@@ -58,7 +61,7 @@ class Held(AbstractCourse):
     def places(self, intervals):
         return np.arange(intervals)[:, None]
 
-    def powers(self, numbers, h):
+    def powers(self, numbers):
         return [numbers[0]]
 
     def series(self, ts, numbers):
@@ -76,7 +79,7 @@ class Linear(AbstractCourse):
     def places(self, intervals):
         return np.arange(intervals)[:, None] + np.arange(2)
 
-    def powers(self, numbers, h):
+    def powers(self, numbers):
         return [numbers[0], numbers[1] - numbers[0]]
 
     def series(self, ts, numbers):
@@ -87,7 +90,9 @@ class Linear(AbstractCourse):
 
 
 class Cubic(AbstractCourse):
-    """Cubic on each interval, with continuous rates; the numbers are the values at all nodes, and then the rates."""
+    """Cubic on each interval, with continuous rates; the numbers are the values at all nodes, and then the rates by the
+    share of the duration.
+    """
 
     name, local, continuous, smooth = "cubic", 4, True, True
 
@@ -95,14 +100,18 @@ class Cubic(AbstractCourse):
         values = np.arange(intervals)[:, None] + np.arange(2)
         return np.concatenate([values, values + intervals + 1], axis=1)
 
-    def powers(self, numbers, h):
-        a, b, rate_a, rate_b = numbers[0], numbers[1], h * numbers[2], h * numbers[3]
+    def weights(self, shares):
+        lengths = np.diff(shares)[:, None]
+        return np.concatenate([np.ones((lengths.size, 2)), np.repeat(lengths, 2, axis=1)], axis=1)
+
+    def powers(self, numbers):
+        a, b, rate_a, rate_b = numbers
         return [a, rate_a, 3 * (b - a) - 2 * rate_a - rate_b, 2 * (a - b) + rate_a + rate_b]
 
     def series(self, ts, numbers):
         values, slopes = np.split(numbers, 2)
         series = Series(ts, values, "cubic")
-        return eqx.tree_at(lambda series: series.slopes, series, jnp.asarray(slopes))
+        return eqx.tree_at(lambda series: series.slopes, series, jnp.asarray(slopes / (ts[-1] - ts[0])))
 
     def numbers(self, values, rates):
         return np.concatenate([values, rates])

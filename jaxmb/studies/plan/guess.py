@@ -12,11 +12,12 @@ from ..._types import Scalar, State
 from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...parts.names import unknown
-from ...parts.series import AbstractSignal
+from ...parts.series import AbstractSignal, Series
 from ...states.assembly import assemble
 from ...system import AbstractSystem, parameters, with_parameters
 from ...system.instant import Instant
 from ..evaluate import evaluate
+from ..inverse.required import RequiredForces
 from .lanes import in_lanes
 from .task import Limits, Task
 
@@ -36,7 +37,7 @@ class Guess(NamedTuple):
 
 
 def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
-    """The guess of a task from a user's guess: None, values by name, a motion, or another plan.
+    """The guess of a task from a user's guess: None, values by name, a motion with or without forces, or a plan.
 
     **Arguments:** `begin`: the state at the start, if the task gives none.
 
@@ -45,7 +46,7 @@ def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
     named: dict[str, Any] = dict(given) if isinstance(given, Mapping) else {}
     motion = None if isinstance(given, Mapping) else given
     if motion is not None and getattr(motion, "ts", None) is None:
-        raise ValueError(f"plan: guess must be values by name, a Trajectory or a Plan; got {motion!r}.")
+        raise ValueError(f"plan: guess must be values by name, a Trajectory, RequiredForces or a Plan; got {motion!r}.")
     low, high = task.duration
     usual = float(motion.ts[-1] - motion.ts[0]) if motion is not None else np.sqrt(low * high)
     duration = float(np.clip(named.pop("duration", usual), low, high))
@@ -55,8 +56,29 @@ def first_guess(task: Task, given: Any, begin: State | None = None) -> Guess:
     # The first number of each course is the value at the first node.
     first = {c.name: x[0].reshape(c.shape) for c, x in zip(task.controls, controls, strict=True)}
     system = with_parameters(system, first)
-    states = _along(task, system, motion, ts) if motion is not None else _straight(task, system, named, ts, begin)
+    if motion is None:
+        states, angles = _straight(task, system, named, ts, begin)
+    else:
+        states, angles = _along(task, system, motion, ts)
+    states = with_turns(system, ts, states, angles)
+    if states.angles is not None:
+        states = State(states.q, states.u, states.z, jnp.asarray(np.unwrap(states.angles, axis=0)))
     return Guess(states, ts, controls, design)
+
+
+def with_turns(system: AbstractSystem, ts: np.ndarray, states: State, near: Any = None) -> State:
+    """The states with angles of joints in space, those next to others."""
+    if not system.wrapped_angle_names():
+        return State(states.q, states.u, states.z)
+    angles = in_lanes(_wrapped, system, ts, states.q)
+    near = angles if near is None else np.broadcast_to(near, angles.shape)
+    turned = angles + 2 * np.pi * np.round((near - angles) / (2 * np.pi))
+    return State(states.q, states.u, states.z, np.where(np.isfinite(turned), turned, near))
+
+
+@jitted
+def _wrapped(system, ts, qs):
+    return jax.vmap(system.wrapped_angles)(ts, qs)
 
 
 def _designed(task, named, motion):
@@ -69,8 +91,7 @@ def _designed(task, named, motion):
 
 
 def _controls(task, named, motion, ts):
-    existing, out = parameters(task.system), []
-    known = getattr(motion, "controls", {})
+    existing, out, known = parameters(task.system), [], _known_controls(task, motion)
     shares = (ts - ts[0]) / (ts[-1] - ts[0])
     for control, (low, high) in zip(task.controls, task.control_bounds, strict=True):
         value = named.pop(control.name, known.get(control.name, existing[control.name]))
@@ -85,14 +106,25 @@ def _controls(task, named, motion, ts):
         else:
             values = np.broadcast_to(np.asarray(value, float), (len(ts), *control.shape))
         values = np.clip(values, low, high)
-        rates = np.gradient(values, ts, axis=0)
+        rates = np.gradient(values, shares, axis=0)
         out.append(control.course.numbers(values, rates).reshape(-1, control.size))
     return tuple(out)
 
 
-def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None) -> State:
+def _known_controls(task: Task, motion: Any) -> Mapping[str, Series]:
+    """The controls of a motion as functions of its time: of another plan, or required forces."""
+    # A concrete class: a trajectory has forces, too, of its force elements.
+    if not isinstance(motion, RequiredForces):
+        return getattr(motion, "controls", {})
+    for name in motion.forces:
+        if name not in (control.name for control in task.controls):
+            raise unknown("control", name, [c.name for c in task.controls], "plan: guess, required_forces(…, by=)")
+    return {name: Series(motion.ts, force, "linear") for name, force in motion.forces.items()}
+
+
+def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.ndarray, begin: State | None) -> Any:
     """Coordinates by name along the way, or straight from the start to the end; on the constraints at some times, one
-    after the other, and between them nearly straight.
+    after the other, and between them nearly straight. Also the angles at the start that tell its turns, or None.
     """
     known = (*system.coordinate_names(), *system.joint_coordinates())
     for name in named:
@@ -123,12 +155,13 @@ def _straight(task: Task, system: AbstractSystem, named: dict[str, Any], ts: np.
         if k or start is None:
             state = _assembled(system, state, fix, t, f"{where} at t = {t:.4g} s")
         states.append(state if k or start is None else start)
+    angles = states[0].angles
     several = jax.tree.map(lambda *x: np.stack(x), *(State(s.q, s.u, s.z) for s in states))
     between = lambda y: np.stack([np.interp(ts, times, column) for column in y.T], axis=1)
     q, z = between(several.q), None if several.z is None else between(several.z)
     slopes = np.gradient(q, ts, axis=0)
     states = _near(system, ts, q, z, slopes)
-    return _with_ends(states, start, task.end if isinstance(task.end, State) else None)
+    return _with_ends(states, start, task.end if isinstance(task.end, State) else None), angles
 
 
 def _assembled(
@@ -158,7 +191,9 @@ def carried(before: AbstractSystem, state: State, system: AbstractSystem, t: Sca
     for name in coordinates:
         if name not in known:
             raise unknown("coordinate", name, known, "plan_phases: a phase begins where the last ended")
-    return _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
+    begin = _assembled(system, None, coordinates, t, "the start of a phase", rates=rates or None)
+    same = before.wrapped_angle_names() == system.wrapped_angle_names()
+    return State(begin.q, begin.u, begin.z, state.angles if same else begin.angles)
 
 
 def _first(system: AbstractSystem, given: State | Limits, t: Scalar, near: State | None) -> State | None:
@@ -219,8 +254,8 @@ def _on_constraints(system, ts, states, slopes):
     return jax.vmap(of_one)(ts, states, slopes)
 
 
-def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> State:
-    """States along a motion or another plan, its time stretched to the duration."""
+def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> Any:
+    """States along a motion or another plan, its time stretched to the duration; the angles at its start, or None."""
     ys, times = motion.states if hasattr(motion, "states") else motion.ys, np.asarray(motion.ts)
     if times.ndim != 1 or times.size < 2:
         raise ValueError("plan: a motion as the guess needs at least two saved times: simulate(…, saveat=times).")
@@ -237,7 +272,8 @@ def _along(task: Task, system: AbstractSystem, motion: Any, ts: np.ndarray) -> S
         between(in_lanes(_rates, system, times, State(ys.q, ys.u, ys.z))) * (times[-1] - times[0]) / (ts[-1] - ts[0])
     )
     states = _near(system, ts, q, z, slopes)
-    return _with_ends(states, *(x if isinstance(x, State) else None for x in (task.start, task.end)))
+    ends = (x if isinstance(x, State) else None for x in (task.start, task.end))
+    return _with_ends(states, *ends), None if ys.angles is None else ys.angles[0]
 
 
 @jitted

@@ -72,11 +72,12 @@ def plan(
     **Arguments:**
 
     - `controls`: bounds `(low, high)` of parameters that become functions of time, either of them None, or None
-        without bounds; parameters as of `with_inputs`. `{}` with a `design` alone.
+        without bounds; parameters of forces as of `with_inputs`. `{}` with a `design` alone.
     - `duration` [s]: a number, or bounds `(low, high)` of a free duration.
     - `start`, `end`: a `State`, whose independent coordinates and rates are given; or by name values, or bounds `(low,
         high)`, of quantities as `evaluate` knows them: `{"pin.angle": 1.0, "pin.angle_rate": 0.0}`. Others are free.
-        For vectors of two components `(x, y)` is the value, and `((x, y), (x, y))` are bounds.
+        For vectors of two components `(x, y)` is the value, and `((x, y), (x, y))` are bounds. Angles of joints in
+        space count turns from the start on, as in a motion.
     - `running`: a function of the instant by names, `lambda at: at["motor.force"] ** 2`; or `"effort"`, the sum of the
         squares of the controls.
     - `final`: a function of the end, `lambda at: -at["tip.position"][0]`; or `"time"`, the duration.
@@ -89,11 +90,12 @@ def plan(
 
     - `intervals`: their number, or the nodes as ascending shares of the duration from 0 to 1.
     - `interpolation` of controls: `"held"`, constant on each interval; `"linear"`; `"cubic"`, with continuous rates.
+        Their bounds hold between nodes, too.
     - `moving`: whether nodes then move to where controls jump; the others stay evenly between them. For least time,
         with `"held"`.
     - `guess`: values or functions of time by name, of coordinates, controls, designed parameters and `"duration"`; or a
-        `Trajectory`; or another `Plan`. By default coordinates go straight from start to end, and controls have the
-        values of the system.
+        `Trajectory`; or `required_forces` of a motion by the names of controls, which are then feasible; or another
+        `Plan`. By default coordinates go straight from start to end, and controls have the values of the system.
     - `t0` [s]: the time of the start.
     - `method`: `"ipopt"`, with exact derivatives (the default if `ipyopt` is installed, by the extra `plan`); or
         `"slsqp"` of SciPy for small plans.

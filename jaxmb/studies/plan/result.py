@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 # Saved times in each interval, and the tolerance of the simulation that checks a plan.
 _SAVED, _CHECK = 8, 1e-10
+# The distance from the end, relative to typical changes, at which a simulation arrives there.
+_ARRIVES = 1e-5
 # The distance from a bound, relative to typical changes, at which a value is at the bound.
 _AT_BOUND = 1e-6
 # The largest number of iterations when a plan is found again for other parameters.
@@ -135,13 +137,18 @@ class Plan(Printed):
 
     @functools.cached_property
     def violation(self) -> dict[str, float]:
-        """The largest violation of each bound along the way, at nodes and between them, in its unit; zero within."""
-        limits = self.solution.transcription.task.path
+        """The largest violation of each bound along the way, at nodes, just before them and at seven times between, in
+        its unit; zero within.
+        """
+        limits, ts, ys = self.solution.transcription.task.path, self.trajectory.ts, self.trajectory.ys
         if not limits.names:
             return {}
-        values = np.asarray(
-            _along(self.system, Named(limits.names), self.trajectory.ts, self.trajectory.ys, self.along)
-        )
+        quantities, nodes = Named(limits.names), np.arange(_SAVED, len(ts), _SAVED)
+        values = np.asarray(_along(self.system, quantities, ts, ys, self.along))
+        if any(not control.course.continuous for control in self.solution.transcription.task.controls):
+            before = {name: np.asarray(series.values)[:-1] for name, series in self.controls.items()}
+            at_nodes = jax.tree.map(lambda y: y[nodes], ys)
+            values = np.concatenate([values, _along(self.system, quantities, ts[nodes], at_nodes, before)])
         excess = np.maximum(np.maximum(limits.low - values, values - limits.high), 0.0)
         return dict(zip(limits.components, map(float, np.max(excess, axis=0)), strict=True))
 
@@ -273,7 +280,9 @@ def judged(plan: Plan) -> Plan:
     contacts = plan.system.contacts
     if not plan.success or not (contacts.contact_names or contacts.friction_names):
         return plan
-    changes = [event for event in plan.trajectory.events if event.kind != "slip"]
+    events = plan.trajectory.events
+    # Friction at the start may have another mode than the state, with another motion.
+    changes = [*(events.at_start if plan.arrival > _ARRIVES else ()), *events]
     if not changes:
         return plan
     first = changes[0]
@@ -315,13 +324,19 @@ def _active(solution: Solution) -> tuple[str, ...]:
     problem, task, places = transcription.problem, transcription.task, transcription.places
     free = problem.low < problem.high
     at_bound = free & (np.minimum(np.abs(z - problem.low), np.abs(z - problem.high)) <= _AT_BOUND * problem.scale)
-    out = [control.name for control, where in zip(task.controls, places.controls, strict=True) if at_bound[where].any()]
+    near_row = problem.row_low < problem.row_high
+    rows = problem.at(z).rows[1:]
+    near_row &= np.minimum(np.abs(rows - problem.row_low), np.abs(rows - problem.row_high)) <= _AT_BOUND
+    row_at_bound = lambda name: near_row[transcription.rows_of.get(name, np.zeros(0, int)) - 1]
+    out = [
+        control.name
+        for control, where in zip(task.controls, places.controls, strict=True)
+        if at_bound[where].any() or row_at_bound(control.name).any()
+    ]
     out += [name for name, own in by_name(task.design, at_bound[places.design]).items() if own.any()]
     out += ["duration"] if not task.moving and task.timed and at_bound[places.times].any() else []
     if task.path.names:
-        rows = transcription.rows_of["path"] - 1
-        values = problem.at(z).rows[1:][rows]
-        near = np.minimum(np.abs(values - problem.row_low[rows]), np.abs(values - problem.row_high[rows])) <= _AT_BOUND
         components = task.path.components
-        out += [components[k] for k in np.flatnonzero(near.reshape(-1, len(components)).any(axis=0))]
+        near = row_at_bound("path").reshape(-1, len(components)).any(axis=0)
+        out += [components[k] for k in np.flatnonzero(near)]
     return tuple(out)

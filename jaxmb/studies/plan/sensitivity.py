@@ -143,16 +143,20 @@ def _read(solution, names, extended, moved, weights):
     task, places = solution.transcription.task, extended.transcription.places
     gradient = _gradient(extended, weights)
     of = lambda values: _by_name(solution, names, values)
-    objective, duration = of(gradient), of(moved[places.times].sum(axis=0))
-    controls = [
-        of(moved[where].reshape(len(where), *control.shape, -1))
-        for control, where in zip(task.controls, places.controls, strict=True)
-    ]
+    objective = of(gradient)
+    controls, whole, growth = [], float(np.ptp(solution.found.ts)), moved[places.times].sum(axis=0)
+    for control, where, numbers in zip(task.controls, places.controls, solution.found.controls, strict=True):
+        own, first = moved[where], task.intervals + 1
+        if control.course.smooth:
+            # Rates by the share of the duration become rates by time.
+            own[first:] = (own[first:] - numbers[first:, :, None] * growth / whole) / whole
+        controls.append(of(own.reshape(len(where), *control.shape, -1)))
+    durations = of(growth)
     designs = [of(own) for own in by_name(task.design, moved[places.design]).values()]
     return {
         name: Sensitivity(
             objective[name],
-            duration[name],
+            durations[name],
             {c.name: own[name] for c, own in zip(task.controls, controls, strict=True)},
             {designed: own[name] for (designed, _), own in zip(task.design, designs, strict=True)},
         )

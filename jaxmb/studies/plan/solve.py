@@ -9,13 +9,14 @@ import numpy as np
 
 from ..._types import State
 from .guess import Guess
+from .lanes import MOST_STEPS
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
 from .task import Task
 from .transcription import Program, Transcription
 
-# The most rounds; the most steps of an interval; charts beyond this quality are replaced.
-_ROUNDS, _MOST_STEPS, _WORN = 40, 256, 3.0
+# The most rounds; charts beyond this quality are replaced.
+_ROUNDS, _WORN = 40, 3.0
 # The smallest error of an interval's end that is asked for.
 _LEAST_ERROR = 1e-10
 # The error of an interval's end, relative to typical changes, that is small enough for a guess.
@@ -72,7 +73,7 @@ def solved(
         program = Program.of(tasks, guesses, steps, scales)
         if scales is None:
             # A guess is no motion: its errors need not be small yet.
-            steps, _ = _enough_steps(program, program.start, steps, _FIRST_ERROR, [_MOST_STEPS] * len(tasks))
+            steps, _ = _enough_steps(program, program.start, steps, _FIRST_ERROR, [MOST_STEPS] * len(tasks))
             program.problem.at(program.start)
             _check_start(program)
             for part in program.parts:

@@ -120,7 +120,7 @@ def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> 
     """The controls by name, and their bounds.
 
     **Raises:** `ValueError` for a name that is no parameter or cannot be an input, for reversed bounds, and for a
-    control of a joint's motion that is not smooth.
+    control on which constraints depend.
     """
     if interpolation not in COURSES:
         raise ValueError(f"plan: interpolation must be 'held', 'linear' or 'cubic', got {interpolation!r}.")
@@ -135,11 +135,11 @@ def checked_controls(system: AbstractSystem, given: Any, interpolation: str) -> 
             raise unknown("control", name, existing, "plan")
         value = existing[name]
         numbers: Any = np.zeros((course.local, *value.shape), value.dtype)
-        driven = with_inputs(system, {name: Piece(course.powers(numbers, 1.0), 0.0, 1.0, True)})
-        if driven.parameter_table.signals[name][1] and not course.smooth:
+        driven = with_inputs(system, {name: Piece(course.powers(numbers), 0.0, 1.0, True)})
+        if driven.parameter_table.signals[name][1]:
             raise ValueError(
-                f"plan: constraints depend on the control {name!r}, whose rate must not jump: take "
-                "interpolation='cubic'."
+                f"plan: constraints depend on the control {name!r}; take a force instead, such as a JointForce on the "
+                "coordinate of the driver."
             )
         pair = (None, None) if pair is None else pair
         low, high = bounds_of(f"plan: the bounds of control {name!r}", pair, value.shape, equal=True)

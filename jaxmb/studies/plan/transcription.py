@@ -20,7 +20,7 @@ from ..._types import State
 from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...system import AbstractSystem
-from .guess import Guess
+from .guess import Guess, with_turns
 from .lanes import AbstractLane, Arrival, Block, Look, Model, Strike, in_lanes
 from .problem import Evaluated, Problem, Term
 from .task import Limits, Named, Task
@@ -48,8 +48,8 @@ def _charts(shared, ts, states):
 
     def of_one(t, state):
         chart = Chart.at(system, t, state)
-        fields = chart.origin, chart.indices, chart.split, chart.fresh
-        return fields, chart.coordinates(chart.origin), scales[chart.indices]
+        origin = State(chart.origin.q, chart.origin.u, chart.origin.z, state.angles)
+        return (origin, chart.indices, chart.split, chart.fresh), chart.coordinates(chart.origin), scales[chart.indices]
 
     return jax.vmap(of_one)(ts, states)
 
@@ -112,8 +112,8 @@ class Transcription:
     """A task as a program near a guess.
 
     **Fields:** the `task`; the `nodes`, charts at the guess; `places` of the variables; the `problem`, and its `start`;
-    `rows_of`: rows of `"gaps"`, which join intervals, `"start"`,
-    `"end"`, `"path"`, `"period"` and `"duration"`; `scales` of controls without bounds.
+    `rows_of`: rows of `"gaps"`, which join intervals, `"start"`, `"end"`, `"path"`, `"period"` and `"duration"`, and of
+    cubic controls with bounds by name; `scales` of controls without bounds.
     """
 
     task: Task
@@ -153,6 +153,7 @@ class Transcription:
         ts = _times(task, z, places)
         system = Model(task.system, task.controls, task.design).designed(jnp.asarray(design))
         states = in_lanes(_states, system, self.nodes.charts, ts, z[places.x])
+        states = with_turns(system, ts, states, self.nodes.charts[0].angles)
         return Guess(states, ts, tuple(z[c] for c in places.controls), design)
 
 
@@ -287,6 +288,7 @@ class _Transcriber:
                 self._limit(where, limits, at)
         if task.path.names:
             self._limit("path", task.path, list(range(task.intervals + 1)))
+        self._within()
         if task.final is not None:
             first = self._look(task.final, [task.intervals], 1)
             self.of_outputs.add(0, first)
@@ -332,12 +334,17 @@ class _Transcriber:
             count = control.course.count(task.intervals)
             values = where[: task.intervals + 1] if control.course.smooth else where
             low[values], high[values] = ends
+            if control.course.smooth:
+                # Bounds between nodes imply those at inner nodes; a held component has no rates.
+                held = ends[0] == ends[1]
+                inner, rates = where[1 : task.intervals][:, ~held], where[task.intervals + 1 :][:, held]
+                low[inner], high[inner], low[rates], high[rates] = -np.inf, np.inf, 0.0, 0.0
             bounded = np.isfinite(ends[0]) & np.isfinite(ends[1]) & (ends[0] < ends[1])
             usual = np.ones(control.size) if control_scales is None else control_scales[number]
             scale[where] = np.where(
                 bounded, 0.5 * (np.where(bounded, ends[1], 1) - np.where(bounded, ends[0], 0)), usual
             )
-            scale[where[task.intervals + 1 : count]] /= np.mean(np.diff(guess.ts))
+            scale[where[task.intervals + 1 : count]] *= task.intervals
         k = 0
         for (_, shape), bounds in zip(task.design, task.design_bounds, strict=True):
             where = places.design[k : k + int(np.prod(shape, dtype=int))]
@@ -362,7 +369,8 @@ class _Transcriber:
         self._add_times(entries, offset, at(n, 2), n)
         for control, where, begin in zip(task.controls, places.controls, begins[2:], strict=False):
             local = where[control.course.places(task.intervals)].reshape(task.intervals, -1)
-            entries.add(at(begin, local.shape[1]), local)
+            weights = np.repeat(control.course.weights(task.shares), control.size, axis=1)
+            entries.add(at(begin, local.shape[1]), local, weights)
         entries.add(at(begins[-2], places.design.size), places.design)
         outputs = self.nodes.charts[0].q.shape[1] + self.nodes.charts[0].u.shape[1] + (task.system.nz or 0) + 2
         charts = jax.tree.map(lambda x: x[:-1], self.nodes.charts)
@@ -438,6 +446,25 @@ class _Transcriber:
         rows = self._rows(where, names, np.tile(limits.low, len(at)) / sizes, np.tile(limits.high, len(at)) / sizes)
         self.of_outputs.add(rows, first + np.arange(len(at) * count), 1.0 / sizes)
 
+    def _within(self) -> None:
+        """Cubic controls are within their bounds between nodes, as the convex hull of Bézier points is."""
+        task = self.task
+        for control, where, ends in zip(task.controls, self.places.controls, task.control_bounds, strict=True):
+            low, high = (np.ravel(side) for side in ends)
+            chosen = np.flatnonzero((np.isfinite(low) | np.isfinite(high)) & (low < high))
+            if not (control.course.smooth and chosen.size):
+                continue
+            limits = Limits((control.name,), (chosen.shape,), low[chosen], high[chosen])
+            sizes = np.tile(limits.sizes, 2 * task.intervals)
+            names = [f"{control.name} in interval {k}" for k in range(task.intervals) for _ in range(2 * chosen.size)]
+            ends = (np.tile(side, 2 * task.intervals) / sizes for side in (limits.low, limits.high))
+            own = self._rows(control.name, names, *ends)
+            places = where[control.course.places(task.intervals)][:, :, chosen]
+            thirds = control.course.weights(task.shares)[:, 2:, None] * np.array([[1.0], [-1.0]]) / 3
+            thirds = np.broadcast_to(thirds, places[:, 2:].shape)
+            self.of_variables.add(own, places[:, :2].reshape(-1), 1.0 / sizes)
+            self.of_variables.add(own, places[:, 2:].reshape(-1), thirds.reshape(-1) / sizes)
+
     def _follow(self, before: Transcription) -> None:
         """Rows of the first node as the last node of the phase before, which are completed where phases are joined:
         all coordinates by name, and if both phases have the same bodies, velocities after the impulse of constraints.
@@ -453,10 +480,17 @@ class _Transcriber:
             self._rows("strike", ["joint velocity"] * zeros.size, zeros, zeros)
 
     def _close(self) -> None:
-        """The last node is the first node, up to turns of angles."""
-        places, nodes = self.places, self.nodes
-        scales, shift = nodes.scales[0], nodes.coordinates[-1] - nodes.coordinates[0]
-        shift = np.where(np.abs(shift) > np.pi, 2 * np.pi * np.round(shift / (2 * np.pi)), 0.0)
-        rows = self._rows("period", ["period"] * scales.size, shift / scales, shift / scales)
-        self.of_variables.add(rows, places.x[-1], 1.0 / scales)
+        """The end is the start, up to turns of angles and the signs of Euler parameters, which the guess tells."""
+        system, places, nodes, ys = self.task.system, self.places, self.nodes, self.guess.states
+        indices, scales = nodes.charts[1][0], nodes.scales[0]
+        signs, turns = np.ones(system.nq + system.nu + system.nz), np.zeros(system.nq + system.nu + system.nz)
+        for name, where in system.coordinate_names().items():
+            if name.endswith(".orientation"):
+                signs[where] = -1.0 if np.dot(ys.q[0, where], ys.q[-1, where]) < 0 else 1.0
+            elif name.endswith(".angle") or not system.body_names:
+                turns[where] = 2 * np.pi * np.round((ys.q[-1, where] - ys.q[0, where]) / (2 * np.pi))
+        shift = turns[indices] / scales
+        rows = self._rows("period", ["period"] * scales.size, shift, shift)
+        last = (self.task.intervals - 1) * self.terms[0].outputs
+        self.of_outputs.add(rows, last + indices, signs[indices] / scales)
         self.of_variables.add(rows, places.x[0], -1.0 / scales)

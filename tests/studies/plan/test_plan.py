@@ -326,11 +326,11 @@ def test_courses_are_their_series_on_each_interval(kind):
     numbers = np.random.default_rng(0).standard_normal((course.count(3), 2))
     series = course.series(ts, numbers)
     places, shares = course.places(3), np.array([0.0, 0.3, 0.9])
-    lengths = np.diff(ts)
+    lengths, weights = np.diff(ts), course.weights(ts / 2.0)
     times = ts[:3, None] + lengths[:, None] * shares
     known = np.asarray(jax.jit(jax.vmap(jax.vmap(series)))(times))
-    for k, h in enumerate(lengths):
-        powers = np.stack(course.powers(numbers[places[k]], h))
+    for k in range(3):
+        powers = np.stack(course.powers(weights[k][:, None] * numbers[places[k]]))
         values = np.stack([np.sum(share ** np.arange(len(powers))[:, None] * powers, axis=0) for share in shares])
         np.testing.assert_allclose(values, known[k], rtol=0, atol=1e-12)
     nodes = numbers[course.values(3)]

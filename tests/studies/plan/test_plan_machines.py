@@ -1,8 +1,10 @@
 """Optimal control of machines against exact optima, Pontryagin's equations, and simulations by another method."""
 
 import functools
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate
@@ -119,6 +121,52 @@ def test_plan_of_a_redundant_loop_in_space_is_the_plan_of_the_plane():
     )
     check_motion(plan)
     np.testing.assert_allclose(plan.objective, LEAST_EFFORT, rtol=1e-8)
+
+
+def stewart():
+    """A platform of 20 kg on six cylinders, between universal joints on the ground and balls on the platform."""
+    angles = np.deg2rad(np.repeat([0.0, 120.0, 240.0], 2) + np.outer([50.0, 15.0], [-1, 1] * 3))
+    feet, heads = (
+        np.stack([radius * np.cos(own), radius * np.sin(own), np.full(6, height)], axis=1)
+        for own, radius, height in zip(angles, (1.0, 0.6), (0.0, 1.0), strict=True)
+    )
+    bodies = [spatial.Body("platform", mass=20.0, inertia=(1.5, 1.5, 3.0), position=(0.0, 0.0, 1.0))]
+    joints: list[Any] = []
+    forces: list[Any] = [mb.Gravity((0.0, 0.0, -9.81))]
+    for k, (foot, head) in enumerate(zip(feet, heads, strict=True)):
+        along = (head - foot) / np.linalg.norm(head - foot)
+        across = np.cross(along, [0.0, 0.0, 1.0])
+        across /= np.linalg.norm(across)
+        ends = ((f"barrel{k}", 2.0, foot + 0.3 * along), (f"rod{k}", 1.0, head - 0.3 * along))
+        bodies += [spatial.Body(name, mass=mass, inertia=(0.04,) * 3, position=at) for name, mass, at in ends]
+        axes = {"axis_a_W": across, "axis_b_W": np.cross(along, across)}
+        joints.append(spatial.Universal(f"foot{k}", "ground", f"barrel{k}", point=foot, **axes))
+        joints.append(spatial.Prismatic(f"slide{k}", f"barrel{k}", f"rod{k}", point=foot, axis=along))
+        joints.append(spatial.Spherical(f"head{k}", f"rod{k}", "platform", point=head))
+        forces.append(mb.JointForce(f"drive{k}", f"slide{k}.displacement", force=0.0))
+    return mb.Scene(bodies, joints=joints, forces=forces).compile()
+
+
+def test_plan_moves_a_stewart_platform_between_two_poses():
+    """Twelve coordinates and rates, six forces: second derivatives of an interval by its 24 inputs are exact."""
+    system = stewart()
+    start, drives = mb.assemble(system), [f"drive{k}.force" for k in range(6)]
+    pose = {"platform.position": (0.15, -0.1, 1.1), "platform.e1": 0.05, "platform.e2": 0.0, "platform.e3": 0.1}
+    end = mb.assemble(system, start, fix=pose)
+    plan = mb.plan(
+        system,
+        controls=dict.fromkeys(drives, (-200.0, 200.0)),
+        duration=1.0,
+        start=start,
+        end=end,
+        running=lambda at: sum(jnp.square(at[name] / 100.0) for name in drives),
+        intervals=8,
+        guess=dict.fromkeys(drives, 60.0),
+    )
+    check_motion(plan)
+    ends = mb.evaluate(system, jax.tree.map(lambda y: y[-1], plan.states), "platform.position")
+    np.testing.assert_allclose(ends, pose["platform.position"], rtol=0, atol=1e-9)
+    assert plan.active == ()
 
 
 def parked(intervals, **options):

@@ -29,7 +29,7 @@ REFUSED = [
     ({"running": lambda at: None}, "running= must return a number, and returns nothing"),
     ({"final": lambda at: at["bar.position"]}, "final= must return a number, and returns shape (2,)"),
     ({"tol": "small"}, "tol must be a real number, got 'small'"),
-    ({"guess": 3.0}, "guess must be values by name, a Trajectory or a Plan; got 3.0"),
+    ({"guess": 3.0}, "guess must be values by name, a Trajectory, RequiredForces or a Plan; got 3.0"),
     ({"moving": True, "interpolation": "cubic"}, "take interpolation='held', got 'cubic'"),
     ({"controls": {"motor.force": (2.0, 2.0)}}, "'motor.force' is held by its bounds"),
     ({"controls": {"push.force": ((1.0, 0.0), (-1.0, 0.0))}}, "must be (low, high) with low ≤ high"),
