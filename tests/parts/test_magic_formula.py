@@ -7,16 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from every_part import TYRE_FILE
 from oracles import magic_formula as oracle
 
 import jaxmb as mb
 from jaxmb import spatial
 from jaxmb.parts import magic_formula, tir
 
-FILES = {
-    version: Path(oracle.__file__).parents[1] / f"example_{name}.tir"
-    for version, name in (("5.2", "52"), ("6.1", "61"))
-}
+FILES = {"5.2": Path(oracle.__file__).parents[1] / "example_52.tir", "6.1": TYRE_FILE}
 VERSIONS = pytest.mark.parametrize("version", FILES)
 SCALES = """LFZO LCX LMUX LEX LKX LHX LVX LCY LMUY LEY LKY LHY LVY LTR LRES LXAL LYKA LVYKA LS LMX LVMX LMY"""
 OWN_SCALES = {"5.2": "LGAX LGAY LGAZ LSGKP LSGAL", "6.1": "LKYC LKZC"}

@@ -138,6 +138,11 @@ def _bare(figure, width, height):
     return axes
 
 
+def _save(shown: Any, path: Path) -> None:
+    # Colours that cover all, not the commonest: a body may be a few pixels.
+    shown.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
 def picture(name: str, path: Path) -> None:
     """A small PNG of a figure of `GALLERY`."""
     notebook, cell = GALLERY[name]
@@ -145,7 +150,7 @@ def picture(name: str, path: Path) -> None:
     (data,) = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
     shown = Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
     shown.thumbnail((640, 480), Image.Resampling.LANCZOS)
-    shown.save(path, optimize=True)
+    _save(shown, path)
 
 
 def moving_picture(trajectory: jaxmb.Trajectory, path: Path) -> None:
@@ -185,7 +190,7 @@ def sliders(path: Path) -> None:
         shown = Image.fromarray((255 * page.picture()).round().astype("uint8"))
     explorer.close()
     shown.thumbnail((800, 600), Image.Resampling.LANCZOS)
-    shown.save(path, optimize=True)
+    _save(shown, path)
 
 
 def main(names: list[str]) -> None:
