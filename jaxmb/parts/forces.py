@@ -62,6 +62,8 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
     linear there. Damping then acts against the relative velocity, its limit along every motion that reaches zero
     length.
 
+    Along a motion it has the quantities `length` [m] and `tension` [N]: `motion.plot("spring.tension")`.
+
     **Arguments:** `stiffness` [N/m] ≥ 0; `damping` [N s/m] ≥ 0; `free_length` [m] ≥ 0, default the length at the
     given poses.
     """
@@ -89,6 +91,10 @@ class SpringDamper(AbstractPointPair, AbstractPotentialForce):
         pretension = jnp.where(apart, self.stiffness * self.free_length / length, 0.0)
         along = jnp.where(apart, jnp.dot(d, rate) / length**2 * d, rate)
         return force_pair(space, self, poses, -(self.stiffness - pretension) * d - self.damping * along)
+
+    def observables(self, space, poses, velocities, t):
+        length, rate = rate_of(space, self, lambda part, x: norm(separation(space, part, x)), poses, velocities)
+        return {"length": length, "tension": _tension(self, length, rate)}
 
     def energy(self, space, poses, t):
         d = separation(space, self, poses)

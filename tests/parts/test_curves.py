@@ -180,3 +180,19 @@ def test_forces_of_a_tyre_are_those_of_a_motion(kind):
     np.testing.assert_allclose([forces.fx, forces.fy], wrench[:2], rtol=1e-6)
     if kind != "brush":
         np.testing.assert_allclose(forces.mz, wrench[5], rtol=1e-6)
+
+
+def test_tension_of_a_spring_is_the_force_that_it_exerts():
+    bar = planar.Body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    pin = planar.Revolute("pin", "ground", "bar", point=(0.0, 0.0))
+    own = {"stiffness": 30.0, "damping": 2.0, "free_length": 0.5}
+    line = planar.SpringDamper("line", "ground", "bar", point_a=(0.0, 1.0), point_b=(0.5, 0.0), **own)
+    system = mb.Scene([bar], joints=[pin], forces=[line, mb.Gravity((0.0, -9.81))]).compile()
+    motion = mb.simulate(system, mb.assemble(system), t1=0.4, saveat=np.linspace(0.0, 0.4, 5))
+    lengths, tensions = motion["line"].length, motion["line"].tension
+    ends = np.asarray(motion["bar"].position) + np.stack(
+        [0.5 * np.cos(motion["bar"].angle), 0.5 * np.sin(motion["bar"].angle)], axis=1
+    )
+    np.testing.assert_allclose(lengths, np.linalg.norm(ends - [0.0, 1.0], axis=1), rtol=1e-12)
+    np.testing.assert_allclose(np.abs(tensions), np.linalg.norm(motion.forces["line"][:, 1, :2], axis=1), rtol=1e-12)
+    assert motion.plot("line.tension").axes[0].get_ylabel() == "tension [N]"
