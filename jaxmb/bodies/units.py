@@ -60,13 +60,15 @@ def named(system: Any, quantity: str) -> Named:
     elif field == "gap":
         word, unit = "gap", "rad" if unit_along(system, part) == "N m" else "m"
     elif field == "drive_force":
-        word, unit = "force of the drive", unit_along(system, part)
+        unit = unit_along(system, part)
+        word = f"{_WORD_OF_UNIT.get(unit, 'force')} of the drive"
     elif not field:
         word, unit = "coordinate", ""
     else:
         word, unit = _WORDS.get(kind, (field.replace("_", " "), ""))
         # Of an internal state of this name, such as the force of a motor.
         unit = declared_unit(system, part, field) or unit
+        word = _WORD_OF_UNIT.get(unit, word) if word == "force" else word
     if order:
         word, unit = _RATES[unit][order - 1] if unit in _RATES else (f"{word}, rate", f"{unit}/s")
     return Named(part, field, word, unit)

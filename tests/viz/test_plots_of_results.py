@@ -64,7 +64,7 @@ def test_a_motion_has_a_panel_for_each_unit(double):
     assert [axes.get_ylabel() for axes in (place, angle)] == ["position [m]", "angle [rad]"]
     assert labels(place) == legend(place) == ["b1 x", "b1 y"] and labels(angle) == ["b1", "p2"]
     # Large torques have a prefix; both are the motor's, so that the curves have their whole names.
-    assert torque.get_ylabel() == "force, force of the drive [kN m]"
+    assert torque.get_ylabel() == "torque, torque of the drive [kN m]"
     assert labels(torque) == ["motor.force", "motor.drive_force"]
     np.testing.assert_allclose(torque.lines[0].get_ydata(), 20.0)
     assert torque.get_xlabel() == "t [s]" and not place.get_xlabel()
