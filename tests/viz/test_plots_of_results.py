@@ -157,7 +157,7 @@ def test_units_of_quantities_and_actuators(double):
         ("p1.angle_rate", "angular velocity", "rad/s"),
         ("p1.angle_acceleration", "angular acceleration", "rad/s²"),
         ("p1.moment", "moment", "N m"),
-        ("motor.force", "force", "N m"),
+        ("motor.force", "torque", "N m"),
     ):
         assert named(system, quantity)[2:] == (word, unit), quantity
     for name, word, unit in (
