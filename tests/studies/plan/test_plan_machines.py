@@ -293,3 +293,34 @@ def test_plan_of_least_time_of_a_knife_edge_under_gravity_is_a_cycloid():
     )
     check_motion(plan)
     np.testing.assert_allclose(plan.objective, CYCLOID, rtol=1e-9)
+
+
+def test_plan_of_a_crane_in_least_time_leaves_no_swing():
+    """A heavy trolley is at rest as soon as without its load if it accelerates for a period of small swings, and then
+    brakes as long: T = 4 π / ω.
+    """
+    period, acceleration, mass = 2 * np.pi / np.sqrt(9.81), 0.01, 1e4
+    trolley = planar.Body("trolley", mass=mass, inertia=1.0)
+    load = planar.PointMass("load", mass=1e-3, position=(0.0, -1.0))
+    joints = [
+        planar.Prismatic("rail", "ground", "trolley", point=(0.0, 0.0), axis=(1.0, 0.0)),
+        planar.Distance("rope", "trolley", "load", point_a=(0.0, 0.0), point_b=(0.0, 0.0)),
+    ]
+    forces = [mb.Gravity((0.0, -9.81)), mb.JointForce("drive", "rail.displacement", force=0.0)]
+    crane = mb.Scene([trolley, load], joints=joints, forces=forces).compile()
+    names, way = ("trolley.x", "load.x"), acceleration * period**2
+    rest = {f"{name}_rate": 0.0 for name in names}
+    here, there = (dict.fromkeys(names, x) | rest for x in (0.0, way))
+    plan = mb.plan(
+        crane,
+        controls={"drive.force": (-acceleration * mass, acceleration * mass)},
+        duration=(period, 4 * period),
+        start=here,
+        end=there,
+        final="time",
+        interpolation="held",
+        intervals=16,
+    )
+    assert plan.success
+    np.testing.assert_allclose(plan.duration, 2 * period, rtol=1e-5)
+    assert plan.arrival < 1e-6
