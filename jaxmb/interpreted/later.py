@@ -26,7 +26,7 @@ from .translate import Unsupported
 _REST = 1.0
 # How often [s] it looks whether it may start, and whether it has stopped.
 _LOOK = 0.05
-# So many functions of NumPy are kept, of each compiled function.
+# So many functions of NumPy are kept, of each compiled function: those that were called last.
 _MOST = 64
 _NO_TRACE = current_trace()
 
@@ -138,6 +138,7 @@ class _Programs:
             _background.busy_at = time.monotonic()
             if len(self._kept) > _MOST:
                 self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
         program = self._kept[key]
         if program is not None and program.has:
             program = self._kept[key] = None

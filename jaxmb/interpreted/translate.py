@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from .._compat import Literal, is_of_jax, like_of
-from ..lanes.calls import called
+from ..lanes.calls import called, entered_in
 from . import values
 from .lines import Let, Line, of_first
 
@@ -59,16 +59,7 @@ class Block:
 # `rule(translator, equation, values)` gives the value of the only output, or the values of all outputs.
 Rule = Callable[["Translator", Any, list[Value]], Any]
 RULES: dict[str, Rule] = {}
-
-
-def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Register a function as the rule of some primitives."""
-
-    def register(function: Rule) -> Rule:
-        RULES.update(dict.fromkeys(names, function))
-        return function
-
-    return register
+rule = entered_in(RULES)
 
 
 class Translator:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .._compat import Literal, bound, is_of_jax, like_of, not_inlined
-from .calls import called
+from .calls import called, entered_in
 
 
 class Value(NamedTuple):
@@ -22,19 +22,11 @@ class Value(NamedTuple):
     varies: bool
 
 
-# `rule(lanes, equation, values)` gives the array of the only output, which varies, or the values of all outputs.
+# `rule(lanes, equation, values)` gives the array of the only output, which varies, or the values of all outputs. At
+# least one operand varies.
 Rule = Callable[["Lanes", Any, list[Value]], Any]
 RULES: dict[str, Rule] = {}
-
-
-def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Register a function as the rule of some primitives, at least one of whose operands varies."""
-
-    def register(function: Rule) -> Rule:
-        RULES.update(dict.fromkeys(names, function))
-        return function
-
-    return register
+rule = entered_in(RULES)
 
 
 class Lanes(NamedTuple):

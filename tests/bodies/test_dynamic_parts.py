@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 import jaxmb as mb
-from jaxmb import parts, planar
+from jaxmb import parts, planar, spatial
 
 MOST_PROGRAMS = 90
 
@@ -135,6 +135,52 @@ def test_body_with_an_internal_state():
     matrix = np.array([[0.0, 1.0, 0.0], [-k / mass, 0.0, -1 / mass], [0.0, beside, -1 / lag]])
     expected = expm(matrix) @ [0.1, 0.0, 0.0]
     np.testing.assert_allclose([slide, pull], expected[[0, 2]], atol=1e-8)
+
+
+class PlanarRocket(planar.AbstractRigidBody, parts.AbstractDynamicPart):
+    """A body that loses mass, with no velocity beside its own."""
+
+    dry: parts.Number = parts.parameter(unit="kg", sign="positive")
+    flow: parts.Number = parts.parameter(unit="kg/s", sign="positive")
+    inertia: parts.Number = parts.parameter(unit="kg m²", shape=None)
+    fuel: parts.Number = parts.internal_state(unit="kg")
+
+    @property
+    def mass(self):
+        return self.dry + self.fuel
+
+    def state_rates(self, space, poses, velocities, t):
+        return {"fuel": -self.flow}
+
+
+class SpatialRocket(spatial.AbstractRigidBody, parts.AbstractDynamicPart):
+    """The same in space."""
+
+    dry: parts.Number = parts.parameter(unit="kg", sign="positive")
+    flow: parts.Number = parts.parameter(unit="kg/s", sign="positive")
+    inertia: parts.Number = parts.parameter(unit="kg m²", shape=(3, 3))
+    fuel: parts.Number = parts.internal_state(unit="kg")
+    mass, state_rates = PlanarRocket.mass, PlanarRocket.state_rates
+
+
+@pytest.mark.parametrize(
+    ("kind", "space", "inertia"), [(PlanarRocket, planar, 1.0), (SpatialRocket, spatial, np.eye(3))]
+)
+def test_body_that_loses_mass_speeds_up_as_a_rocket(kind, space, inertia):
+    """Tsiolkovsky: v = F / ṁ ln(m₀ / m), and its derivative by the flow."""
+    dry, fuel, flow, force = 2.0, 3.0, 1.5, 4.0
+    rocket = kind("rocket", dry=dry, fuel=fuel, flow=flow, inertia=inertia)
+    push = space.PointForce("push", "rocket", force=force * np.eye(space.Body.dimensions[0])[0])
+    system = mb.Scene([rocket], forces=[push]).compile()
+
+    def speed(flow):
+        changed = mb.with_parameters(system, {"rocket.flow": flow})
+        return mb.simulate(changed, changed.guess, t1=1.0, rtol=1e-10, atol=1e-12).ys.u[-1, 0]
+
+    expected = lambda flow: force / flow * jnp.log((dry + fuel) / (dry + fuel - flow))
+    found = jax.jit(lambda x: (speed(x), jax.grad(speed)(x), jax.jvp(speed, (x,), (1.0,))[1]))(flow)
+    slope = jax.grad(expected)(flow)
+    np.testing.assert_allclose(found, [expected(flow), slope, slope], rtol=1e-8)
 
 
 class Lagging(parts.AbstractConstraint, parts.AbstractDynamicPart):

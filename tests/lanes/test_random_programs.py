@@ -18,7 +18,7 @@ from jax import lax
 
 from jaxmb._branches import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from jaxmb._compat import while_loop
-from jaxmb.interpreted import Unsupported, interpreted
+from jaxmb.interpreted import interpreted
 from jaxmb.lanes import in_lanes
 
 # The sizes of axes; some are the numbers of members as well.
@@ -26,6 +26,8 @@ SIZES, LARGE = (1, 2, 3, 5, 8), (12, 20)
 MEMBERS = (3, 5, 8)
 _LARGEST = 600
 NONE, FORWARD, ALL = range(3)
+# Programs with `cumlogsumexp` and `top_k`, which NumPy does not compute.
+FOR_THE_COMPILER = {102, 107, 110, 112, 114, 115}
 DEPTH = 2
 
 
@@ -506,15 +508,13 @@ def test_random_programs_have_the_results_of_a_loop(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(100, 112))
+@pytest.mark.parametrize("seed", [x for x in range(100, 118) if x not in FOR_THE_COMPILER])
 def test_random_programs_have_the_results_of_numpy(seed):
+    """XLA optimises as by default: with less, it makes a NaN in program 113, where JAX makes none by single operations."""
     given, varies = arguments(seed)
     example = [x[0] if v else x for x, v in zip(given, varies, strict=True)]
     traced = jax.jit(functools.partial(program, seed, 6, DEPTH, ALL if seed % 2 else NONE)).trace(*example)
-    try:
-        by_numpy = interpreted(traced.jaxpr)
-    except Unsupported as error:
-        pytest.skip(f"only the compiler knows {error}")
-    for k, (found, expected) in enumerate(zip(by_numpy(example), traced.lower().compile()(*example), strict=True)):
+    by_numpy, compiled = interpreted(traced.jaxpr), traced.lower().compile({"xla_backend_optimization_level": 3})
+    for k, (found, expected) in enumerate(zip(by_numpy(example), compiled(*example), strict=True)):
         assert (found.shape, found.dtype) == (expected.shape, expected.dtype), (seed, k, found.shape, expected.shape)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=f"program {seed}, result {k}")
