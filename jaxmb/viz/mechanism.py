@@ -18,7 +18,7 @@ from ..trajectory import Trajectory, picture_of
 from .figure import color as color_of, new_figure
 from .meshes import heights
 from .one_motion import check_finite, one_motion, poses_of
-from .silhouettes import area, edges, strip, stroke
+from .silhouettes import area, edges, size, strip, stroke
 from .solids import Placed, color_in, solids
 
 if TYPE_CHECKING:
@@ -125,7 +125,9 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -
 
 def _draw_areas(axes, picture, shapes, time, fade):
     areas = [(in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
-    for corners, color in sorted(areas, key=lambda polygon: float(np.mean(polygon[0][:, 2]))):
+    # From the back to the front; of one depth, small areas before large ones.
+    order = lambda polygon: (round(polygon[0][0, 2] / picture.width, 3), -size(polygon[0]))
+    for corners, color in sorted(areas, key=order):
         axes.fill(
             *corners[:, :2].T, facecolor=faded(color, fade), edgecolor=faded(_EDGE, fade), linewidth=0.4, zorder=2
         )
@@ -145,7 +147,7 @@ def _draw_paths(axes, picture, time, fade):
                 axes.fill(*corners.T, color=color, linewidth=0.6, zorder=2)
             continue
         points = stroke(line, time, picture.width)[:, : 2 if picture.planar else 3]
-        axes.plot(*points.T, color=color, linewidth=2.0 if line.kind in ("belt", "bar") else 1.0, zorder=2)
+        axes.plot(*points.T, color=color, linewidth=1.0 if line.kind in ("rod", "coil") else 2.0, zorder=2)
 
 
 def _draw_ground(axes, ground):
