@@ -31,6 +31,8 @@ _TIMES = 6
 # The least width of a picture, relative to its height, and the other way round.
 _THIN = 0.2
 _EDGE: Color = (40, 40, 40)
+# Of a figure in space, in inches: the margin, the height of a title, and the largest height of the axes.
+_PAD, _TITLE, _HIGHEST = 0.12, 0.35, 6.0
 
 
 def plot_mechanism(
@@ -81,9 +83,8 @@ def plot_mechanism(
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")
-    finish(figure, axes, picture, shapes)
     title = "t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s" if len(shown) <= _TIMES else ""
-    axes.set_title("  ·  ".join(filter(None, [title, *picture.notes])), fontsize="medium")
+    finish(figure, axes, picture, shapes, "  ·  ".join(filter(None, [title, *picture.notes])))
     return figure
 
 
@@ -103,9 +104,10 @@ def drawn(picture: Picture, shapes: Sequence[Placed], shown: Sequence[int]) -> t
     return figure, axes
 
 
-def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -> None:
-    """Draw the terrain, and give the axes labels and equal scales; upwards is up in space, too."""
+def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], title: str, **style: Any) -> None:
+    """Draw the terrain, and give the axes labels, equal scales and a title; upwards is up in space, too."""
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    style = {"fontsize": "medium", **style}
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
@@ -115,12 +117,45 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -
         half = np.maximum(size, _THIN * size.max()) / 2
         axes.set(**{name: (x - h, x + h) for name, x, h in zip(("xlim", "ylim"), middle, half, strict=True)})
         figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
+        axes.set_title(title, **style)
     else:
         axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
         axes.set(zlabel="z [m]", aspect="equal")
         sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
-        for name, size in zip("xyz", sizes, strict=True):
-            axes.locator_params(axis=name, nbins=max(1, round(8 * size / sizes.max())), min_n_ticks=1)
+        for k, name in enumerate("xyz"):
+            axes.locator_params(axis=name, nbins=max(1, round(8 * sizes[k] / sizes.max())), min_n_ticks=1)
+            # Distances of labels are relative to the other sides; a label stands beyond the numbers at thin boxes, too.
+            getattr(axes, f"{name}axis").labelpad = 13.5 * sizes.max() / np.delete(sizes, k).max() - 9.5
+        _fill(figure, axes, title, style)
+
+
+def _fill(figure, axes, title, style):
+    """Let the box of axes in space with its labels fill a figure that is as high as they need."""
+    from matplotlib.transforms import Bbox
+
+    axes.set_in_layout(False)
+    legends = [legend.get_window_extent().width / figure.dpi + _PAD for legend in figure.legends]
+    width, side = figure.get_figwidth() - 2 * _PAD - max(legends, default=0.0), figure.get_figheight()
+    for _ in range(2):
+        size = figure.get_size_inches()
+        axes.set_position([0.0, 0.0, *(side / size)])
+        figure.draw_without_rendering()
+        # The box reaches beyond the limits of its axes.
+        limits = [x + np.ptp(x) / 24 * np.array([-1, 1]) for x in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+        corners = axes.transData.transform(flat(axes, np.reshape(np.meshgrid(*limits), (3, -1))))
+        seen = [Bbox([corners.min(axis=0), corners.max(axis=0)])]
+        box = Bbox.union([*seen, *(axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis))])
+        left, low, right, high = np.array(box.extents) / figure.dpi
+        scale = min(width / (right - left), _HIGHEST / (high - low))
+        side *= scale
+    left, low, right, high = scale * np.array([left, low, right, high])
+    figure.set_figheight(high - low + 2 * _PAD + _TITLE)
+    size = figure.get_size_inches()
+    place = np.array([_PAD + 0.5 * (width - (right - left)) - left, _PAD - low])
+    axes.set_position([*(place / size), *(side / size)])
+    # The title stands above the box, and in the middle of it.
+    x, y = (_PAD + 0.5 * width - place[0]) / side, (_PAD + high - low + 0.1 - place[1]) / side
+    axes.set_title(title, y=y, **style).set_position((x, y))
 
 
 def _draw_areas(axes, picture, shapes, time, fade):
@@ -159,6 +194,13 @@ def _draw_ground(axes, ground):
     bottom = min(axes.get_ylim()[0], float(line[:, 1].min()) - 0.02 * (high - low))
     axes.fill_between(line[:, 0], line[:, 1], bottom, color=faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
     axes.set(xlim=(low, high), ylim=(bottom, axes.get_ylim()[1]))
+
+
+def flat(axes: Any, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 2"]:
+    """Points of axes in space, as the figure shows them."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    return np.stack(proj_transform(*points, axes.get_proj())[:2], axis=-1)
 
 
 def in_world(picture: Picture, body: str, points: Float[np.ndarray, "n 3"], time: int) -> Float[np.ndarray, "n 3"]:

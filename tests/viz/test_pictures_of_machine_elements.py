@@ -1,5 +1,8 @@
 """Gears, cams, racks, screws and ropes are drawn as engineers draw them, from their own numbers."""
 
+import itertools
+import types
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from jaxmb import planar, spatial, viz
 from jaxmb.linalg.rotations import rotation_matrix
 from jaxmb.trajectory import picture_of, still
 from jaxmb.viz.motion_nodes import motion
+from jaxmb.viz.scenery import View
 from jaxmb.viz.silhouettes import area
 from jaxmb.viz.solids import solids
 
@@ -174,3 +178,17 @@ def test_small_areas_stand_before_large_ones():
     disc = max(range(len(sizes)), key=lambda k: np.ptp(patches[k].get_xy()[:, 1]))
     bars = [k for k, size in enumerate(sizes) if 0.4 < size < 0.6 and k != disc]
     assert bars and all(k > disc for k in bars)
+
+
+@pytest.mark.parametrize("size", [(4.0, 0.1, 0.1), (0.1, 0.1, 4.0), (1.0, 2.0, 0.5)])
+def test_camera_is_as_near_as_the_motion_allows(size):
+    """All corners of the region are seen, and a corner is near the edge."""
+    bounds = np.array([np.zeros(3), size])
+    shown = types.SimpleNamespace(planar=False, up=np.array([0.0, 0.0, 1.0]))
+    camera = View.of([types.SimpleNamespace(picture=shown, bounds=bounds)], False).camera
+    ahead = (camera.target - camera.position) / np.linalg.norm(camera.target - camera.position)
+    right = np.cross(ahead, camera.up) / np.linalg.norm(np.cross(ahead, camera.up))
+    rays = np.array(list(itertools.product(*bounds.T))) - camera.position
+    half = np.tan(camera.field_of_view / 2) * (rays @ ahead)
+    places = np.abs([rays @ right / (1.6 * half), rays @ np.cross(right, ahead) / half])
+    assert 0.8 < places.max() < 0.9
