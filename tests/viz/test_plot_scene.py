@@ -126,21 +126,21 @@ def overlaps(boxes):
     return [max(0.0, min(a.x1, b.x1) - max(a.x0, b.x0)) * max(0.0, min(a.y1, b.y1) - max(a.y0, b.y0)) for a, b in pairs]
 
 
-def crowded(own, **axis):
-    """Five bodies on one axle."""
-    at = np.zeros(2 if own is planar else 3)
-    inertia = 0.1 if own is planar else np.eye(3)
+def crowded(own, way, **axis):
+    """Five bodies on one axle, and another one away."""
+    at, inertia = 0.0 * np.array(way), 0.1 if own is planar else np.eye(3)
     bodies = [own.Body(f"wheel {k}", mass=1.0, inertia=inertia, position=at) for k in range(5)]
-    arm = own.Body("arm", mass=1.0, inertia=inertia, position=at + np.eye(len(at))[0])
-    joints = [own.Revolute(f"axle {x.name}", "ground", x.name, point=at, **axis) for x in (*bodies, arm)]
-    return mb.Scene([*bodies, arm], joints=joints)
-
-
-@pytest.mark.parametrize("own, axis", [(planar, {}), (spatial, {"axis": (0.0, 0.0, 1.0)})], ids=["plane", "space"])
-def test_names_neither_overlap_nor_leave_the_figure(own, axis):
-    figure = viz.plot_scene(crowded(own, **axis))
+    bodies.append(own.Body("arm", mass=1.0, inertia=inertia, position=way))
+    joints = [own.Revolute(f"axle {x.name}", "ground", x.name, point=at, **axis) for x in bodies]
+    figure = viz.plot_scene(mb.Scene(bodies, joints=joints))
     figure.draw_without_rendering()
-    boxes = [super(type(text), text).get_window_extent() for text in figure.axes[0].texts]
+    return figure, figure.axes[0]
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_names_neither_overlap_nor_leave_the_figure(way):
+    figure, axes = crowded(planar, way) if len(way) == 2 else crowded(spatial, way, axis=(0.0, 0.0, 1.0))
+    boxes = [super(type(text), text).get_window_extent() for text in axes.texts]
     assert len(boxes) == 12 and max(overlaps(boxes)) == 0.0
     for box in boxes:
         assert box.x0 >= 0 and box.y0 >= 0 and (box.max <= figure.bbox.max).all()
@@ -148,13 +148,7 @@ def test_names_neither_overlap_nor_leave_the_figure(own, axis):
 
 @pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
 def test_a_machine_in_space_fills_its_figure(way):
-    way = np.array(way)
-    bodies = [spatial.Body(f"b{k}", mass=1.0, inertia=np.eye(3), position=(2 * k + 1) * way) for k in range(3)]
-    ends = ["ground", *(body.name for body in bodies)]
-    joints = [spatial.Spherical(f"j{k}", ends[k], ends[k + 1], point=2 * k * way) for k in range(3)]
-    figure = viz.plot_scene(mb.Scene(bodies, joints=joints))
-    figure.draw_without_rendering()
-    (axes,) = figure.axes
+    figure, axes = crowded(spatial, way, axis=(0.0, 0.0, 1.0))
     shown = [*(axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)), axes.title.get_window_extent()]
     low, high = np.min([box.min for box in shown], axis=0), np.max([box.max for box in shown], axis=0)
     size = figure.bbox.max
