@@ -131,24 +131,14 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
 
 def _fill(figure, axes, title, style):
     """Let the box of axes in space with its labels fill a figure that is as high as they need."""
-    from matplotlib.transforms import Bbox
-
     axes.set_in_layout(False)
     legends = [legend.get_window_extent().width / figure.dpi + _PAD for legend in figure.legends]
     width, side = figure.get_figwidth() - 2 * _PAD - max(legends, default=0.0), figure.get_figheight()
-    for _ in range(2):
-        size = figure.get_size_inches()
-        axes.set_position([0.0, 0.0, *(side / size)])
-        figure.draw_without_rendering()
-        # The box reaches beyond the limits of its axes.
-        limits = [x + np.ptp(x) / 24 * np.array([-1, 1]) for x in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-        corners = axes.transData.transform(flat(axes, np.reshape(np.meshgrid(*limits), (3, -1))))
-        seen = [Bbox([corners.min(axis=0), corners.max(axis=0)])]
-        box = Bbox.union([*seen, *(axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis))])
-        left, low, right, high = np.array(box.extents) / figure.dpi
-        scale = min(width / (right - left), _HIGHEST / (high - low))
-        side *= scale
-    left, low, right, high = scale * np.array([left, low, right, high])
+    fits = lambda box: min(width / (box[2] - box[0]), _HIGHEST / (box[3] - box[1]))
+    side *= fits(_extents(figure, axes, side))
+    # Words do not grow with the box: a second look.
+    box = _extents(figure, axes, side)
+    side, (left, low, right, high) = side * fits(box), fits(box) * box
     figure.set_figheight(high - low + 2 * _PAD + _TITLE)
     size = figure.get_size_inches()
     place = np.array([_PAD + 0.5 * (width - (right - left)) - left, _PAD - low])
@@ -156,6 +146,20 @@ def _fill(figure, axes, title, style):
     # The title stands above the box, and in the middle of it.
     x, y = (_PAD + 0.5 * width - place[0]) / side, (_PAD + high - low + 0.1 - place[1]) / side
     axes.set_title(title, y=y, **style).set_position((x, y))
+
+
+def _extents(figure, axes, side):
+    """The least x and y, and the largest ones, of the box with its labels [in], if the axes are as wide as `side`."""
+    from matplotlib.transforms import Bbox
+
+    axes.set_position([0.0, 0.0, *(side / figure.get_size_inches())])
+    figure.draw_without_rendering()
+    # The box reaches beyond the limits of its axes.
+    limits = [x + np.ptp(x) / 24 * np.array([-1, 1]) for x in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    corners = axes.transData.transform(flat(axes, np.reshape(np.meshgrid(*limits), (3, -1))))
+    seen = Bbox([corners.min(axis=0), corners.max(axis=0)])
+    labels = [axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+    return np.array(Bbox.union([seen, *labels]).extents) / figure.dpi
 
 
 def _draw_areas(axes, picture, shapes, time, fade):
@@ -200,7 +204,8 @@ def flat(axes: Any, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 2"
     """Points of axes in space, as the figure shows them."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-    return np.stack(proj_transform(*points, axes.get_proj())[:2], axis=-1)
+    x, y, z = points
+    return np.stack(proj_transform(x, y, z, axes.get_proj())[:2], axis=-1)
 
 
 def in_world(picture: Picture, body: str, points: Float[np.ndarray, "n 3"], time: int) -> Float[np.ndarray, "n 3"]:
