@@ -11,6 +11,8 @@ from scipy.optimize import brentq
 
 import jaxmb as mb
 from jaxmb import parts, planar, spatial
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.parts.modes import CLOSED
 
 MOST_PROGRAMS = 90
 
@@ -64,15 +66,29 @@ class MaxwellSlider(PlanarSlider, parts.AbstractDynamicPart):
         return {"pull": self.beside * velocities[1, 0] - self.pull / self.lag}
 
 
-def test_friction_of_a_contact_that_fades():
-    """The time at which a point stops on a floor, and its derivative."""
-    start, mu, lag = 2.0, 0.4, 0.3
+def fading(start, mu, lag):
+    """A point that slides on a floor."""
     body = planar.PointMass("body", mass=1.0, velocity=(start, 0.0))
     floor = mb.RigidContact("floor", "body", terrain=mb.terrain.Flat())
     rub = FadingFriction("rub", "floor", coefficient=mu, lag=lag)
-    system = mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
+    return mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
+
+
+def test_friction_of_a_contact_is_that_of_its_internal_state():
+    system = fading(2.0, 0.4, 0.3)
     assert system.state_names() == {"rub.fade": [0]} and "rub.lag" in mb.parameters(system)
-    closed = system.contacts.with_modes(system.guess.q, np.array([1.0, 0.0]))
+    q = system.contacts.with_modes(system.guess.q, np.array([CLOSED, 1.0]))
+    found = jax.jit(lambda y: accelerations(system.at(y), Multipliers(), jnp.zeros(()), y.q, y.u)[0])
+    udot = found(mb.State(q, system.guess.u, jnp.array([0.3])))
+    np.testing.assert_allclose(udot[:2], [-0.4 * (1 - 0.3) * G, 0.0], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_friction_of_a_contact_that_fades():
+    """The time at which a point stops on a floor, and its derivative."""
+    start, mu, lag = 2.0, 0.4, 0.3
+    system = fading(start, mu, lag)
+    closed = system.contacts.with_modes(system.guess.q, np.array([CLOSED, 0.0]))
 
     @jax.jit
     def run(lag):
@@ -163,8 +179,11 @@ class SpatialRocket(spatial.AbstractRigidBody, parts.AbstractDynamicPart):
     mass, state_rates = PlanarRocket.mass, PlanarRocket.state_rates
 
 
+@pytest.mark.slow("space")
 @pytest.mark.parametrize(
-    ("kind", "space", "inertia"), [(PlanarRocket, planar, 1.0), (SpatialRocket, spatial, np.eye(3))]
+    ("kind", "space", "inertia"),
+    [(PlanarRocket, planar, 1.0), (SpatialRocket, spatial, np.eye(3))],
+    ids=["plane", "space"],
 )
 def test_body_that_loses_mass_speeds_up_as_a_rocket(kind, space, inertia):
     """Tsiolkovsky: v = F / ṁ ln(m₀ / m), and its derivative by the flow."""
@@ -178,7 +197,7 @@ def test_body_that_loses_mass_speeds_up_as_a_rocket(kind, space, inertia):
         return mb.simulate(changed, changed.guess, t1=1.0, rtol=1e-10, atol=1e-12).ys.u[-1, 0]
 
     expected = lambda flow: force / flow * jnp.log((dry + fuel) / (dry + fuel - flow))
-    found = jax.jit(lambda x: (speed(x), jax.grad(speed)(x), jax.jvp(speed, (x,), (1.0,))[1]))(flow)
+    found = jax.jit(lambda x: (*jax.jvp(speed, (x,), (1.0,)), jax.grad(speed)(x)))(flow)
     slope = jax.grad(expected)(flow)
     np.testing.assert_allclose(found, [expected(flow), slope, slope], rtol=1e-8)
 

@@ -9,6 +9,8 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import parts, planar
+from jaxmb.formulations import Multipliers, accelerations
+from jaxmb.parts.modes import CLOSED
 
 MOST_PROGRAMS = 70
 
@@ -95,20 +97,37 @@ def test_restitution_that_depends_on_the_speed():
         np.testing.assert_allclose(slopes[:5, k][of_soft], along, rtol=1e-6, atol=1e-8)
 
 
-def test_friction_that_depends_on_the_speed():
-    """A point slides until `v' = −(μ + c v) g` has used up its velocity."""
-    mu, c, start = 0.2, 0.3, 2.0
+def on_oil(mu, c, start):
+    """A point that slides on a floor."""
     body = planar.PointMass("body", mass=1.0, velocity=(start, 0.0))
     floor = mb.RigidContact("floor", "body", terrain=mb.terrain.Flat())
     rub = OilyFriction("rub", "floor", coefficient=mu, viscous=c)
-    system = mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
+    return mb.Scene([body], joints=[floor], forces=[GRAVITY, rub]).compile()
+
+
+def test_friction_that_depends_on_the_speed():
+    """`v' = −(μ + c v) g` in slip, and μ is the limit of stick."""
+    system = on_oil(0.2, 0.3, 2.0)
+    q = system.contacts.with_modes(system.guess.q, np.array([CLOSED, 1.0]))
+    found = jax.jit(lambda u: accelerations(system, Multipliers(), jnp.zeros(()), q, u)[0][0])
+    for speed in (0.5, 2.0):
+        udot = found(system.guess.u.at[0].set(speed))
+        np.testing.assert_allclose(udot, -(0.2 + 0.3 * speed) * G, rtol=1e-12)
+    np.testing.assert_allclose(system.contact_laws(0.0).slip.ask("limit"), [0.2])
+
+
+@pytest.mark.slow
+def test_point_on_oil_slides_to_its_stop():
+    """Until `v' = −(μ + c v) g` has used up its velocity."""
+    mu, c, start = 0.2, 0.3, 2.0
+    system = on_oil(mu, c, start)
 
     @jax.jit
     def run(state):
         motion = mb.simulate(system, state, t1=1.0, max_events=2)
         return motion.events.times, motion["body"].position[-1, 0]
 
-    closed = system.contacts.with_modes(system.guess.q, np.array([1.0, 0.0]))
+    closed = system.contacts.with_modes(system.guess.q, np.array([CLOSED, 0.0]))
     times, x = run(mb.State(closed, system.guess.u))
     stop = np.log(1 + c * start / mu) / (c * G)
     np.testing.assert_allclose(times, [stop, np.inf], rtol=1e-8)

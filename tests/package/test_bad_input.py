@@ -33,7 +33,6 @@ REFUSED = {
     "name of the ground": (lambda: mb.Scene([bar("ground")]), "'ground' is used twice.*fixed world"),
     "empty name": (lambda: mb.Scene([bar("")]), "must not be empty"),
     "dot in a name": (lambda: mb.Scene([bar("a.b")]), "dot"),
-    "unknown body": (lambda: mb.Scene([bar()], joints=[pin(b="baar")]), "pin.*Unknown body 'baar'; did you mean 'bar'"),
     "joint with itself": (lambda: mb.Scene([bar()], joints=[pin(a="bar")]), "pin.*with itself"),
     "a body without a list": (lambda: mb.Scene(bar()), "A scene takes lists, .*got Body 'bar': give a list of it"),
     "a joint without a list": (lambda: mb.Scene([bar()], joints=pin()), "got Revolute 'pin': give a list of it"),
@@ -51,10 +50,8 @@ REFUSED = {
         "one Gravity",
     ),
     "planar joint in space": (lambda: mb.Scene([SPATIAL], joints=[pin(b="body")]), "pin.*is planar.*scene is spatial"),
-    "spatial body in the plane": (lambda: mb.Scene([bar(), SPATIAL]), "body.*is spatial.*scene is planar"),
     "mass": (lambda: mb.Scene([bar(mass=0.0)]).compile(), "bar.*mass must be positive"),
     "inertia": (lambda: mb.Scene([bar(inertia=-1.0)]).compile(), "bar.*inertia must be positive"),
-    "complex mass": (lambda: bar(mass=1.0 + 1.0j), "expected a real number"),
     "not finite": (lambda: mb.Scene([bar(position=(np.nan, 0.0))]).compile(), "bar.*position must be finite"),
     "gravity's shape": (lambda: mb.Scene([bar()], forces=[mb.Gravity((0, 0, -9.81))]).compile(), "gravity.*shape"),
     "infinite stiffness": (
@@ -112,8 +109,6 @@ def test_assembly_names_what_cannot_be_fixed(pendulum):
         mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0})
     with pytest.raises(ValueError, match=r"rates bar.x, bar.angle fixed"):
         mb.assemble(pendulum, rates={"bar.x": 1.0, "bar.angle": 0.5})
-    with pytest.raises(ValueError, match="not finite"):
-        mb.assemble(pendulum, fix={"bar.angle": np.nan})
     quiet = mb.assemble(pendulum, fix={"bar.x": 2.0, "bar.y": 2.0}, throw=False)
     assert np.all(np.isnan(quiet.q))
 

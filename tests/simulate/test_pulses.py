@@ -206,13 +206,12 @@ def hidden(values):
 
 
 def test_no_more_than_a_tenth_is_hidden_between_stops():
-    at = mb.assemble(TORQUE)
     for seed in range(4):
         rng = np.random.default_rng(seed)
         ts, values = np.sort(rng.uniform(-1.0, 11.0, 60)), np.cumsum(rng.normal(size=60)) * 10.0 ** rng.integers(-6, 6)
         ts[0], ts[-1] = -1.0, 11.0
         system = mb.with_inputs(TORQUE, {"motor.torque": mb.Series(ts, values)})
-        stops = np.asarray(turning_times(system, at, 0.0, END))
+        stops = np.asarray(turning_times(system, system.guess, 0.0, END))
         stops = stops[np.isfinite(stops)]
         assert np.all(np.isin(stops, ts)) and np.all((stops > 0) & (stops < END))
         grid = np.unique(np.concatenate([[0.0, END], ts[(ts > 0) & (ts < END)]]))
@@ -227,7 +226,7 @@ def test_no_more_than_a_tenth_is_hidden_between_stops():
 
 
 def test_what_does_not_come_and_go_needs_no_stops():
-    at = mb.assemble(TORQUE)
+    at = TORQUE.guess
     stops = lambda signal: turning_times(mb.with_inputs(TORQUE, {"motor.torque": signal}), at, 0.0, END)
     assert not np.any(np.isfinite(stops(lambda t: 3.0 + 0.0 * t)))
     assert not np.any(np.isfinite(stops(lambda t: jnp.tanh(t - 4.0))))
