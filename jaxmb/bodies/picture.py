@@ -67,7 +67,8 @@ def picture(
 
 def _pictured(group):
     """The parts as a picture shows them; parts on the ground keep their given places."""
-    moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
+    # A part may have no numbers, such as a driver of an angle by a function.
+    moved = jax.vmap(lambda part: part.pictured(group.layout.space), axis_size=len(group.names))(group.part)
     last = np.flatnonzero(group.layout.is_place(group.bodies[0]))[-1]
     on_ground = group.body_index[:, last] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)

@@ -91,6 +91,19 @@ def test_plot_scene_of_joints_whose_points_need_not_meet():
     assert y[1] > y[0] and abs(x[1] - x[0]) < 0.2 * (y[1] - y[0])
 
 
+def test_plot_scene_of_a_driver_without_numbers():
+    """Its angle is a function, and its points are the defaults."""
+    scene = mb.Scene(
+        [bar("crank", 1.0, (0.5, 0.0), 0.0)],
+        joints=[
+            planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+            planar.Driver("turn", "ground", "crank", quantity="angle", motion=lambda t, p: 2.0 * t),
+        ],
+    )
+    texts, gaps, title = read(viz.plot_scene(scene))
+    assert {"crank", "A"} <= texts and gaps == [] and title == "all joints are closed"
+
+
 def test_plot_scene_refuses_what_it_cannot_draw():
     scene = four_bar()
     with pytest.raises(ValueError, match=r"at the poses of its bodies; a state needs a compiled system"):
