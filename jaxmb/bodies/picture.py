@@ -173,7 +173,7 @@ def _width(length, parts, places, owners):
 
 
 def _paths(system, group, ts, ys, up) -> dict[str, Line]:
-    lines, slack = (_world_values(system, group, hook, ts, ys) for hook in ("path", "slack"))
+    lines, slack = (_world_values(system, group, hook, ts, ys) for hook in ("path", "excess_length"))
     if lines is None:
         return {}
     lines = in_space(lines)
