@@ -76,7 +76,8 @@ def picture(
 
 def _pictured(group):
     """The parts as a picture shows them; parts on the ground keep their given places."""
-    moved = jax.vmap(lambda part: part.pictured(group.layout.space))(group.part)
+    # A part may have no numbers, such as a driver of an angle by a function.
+    moved = jax.vmap(lambda part: part.pictured(group.layout.space), axis_size=len(group.names))(group.part)
     last = np.flatnonzero(group.layout.is_place(group.bodies[0]))[-1]
     on_ground = group.body_index[:, last] == group.layout.ground
     kept = lambda old, new: jnp.where(on_ground.reshape(-1, *[1] * (new.ndim - 1)), old, new)
@@ -172,7 +173,7 @@ def _width(length, parts, places, owners):
 
 
 def _paths(system, group, ts, ys, up) -> dict[str, Line]:
-    lines, slack = (_world_values(system, group, hook, ts, ys) for hook in ("path", "slack"))
+    lines, slack = (_world_values(system, group, hook, ts, ys) for hook in ("path", "excess_length"))
     if lines is None:
         return {}
     lines = in_space(lines)

@@ -653,7 +653,7 @@ class AbstractLink(AbstractActor):
         """
         return None if self.path_kind is None else both_points(space, self, poses)
 
-    def slack(self, space: AbstractSpace, poses: Poses) -> Scalar | None:
+    def excess_length(self, space: AbstractSpace, poses: Poses) -> Scalar | None:
         """Hook: how much longer [m] the part is than its `path` of two points, between which a picture lets it hang."""
         del space, poses
         return None

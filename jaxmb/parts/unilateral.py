@@ -540,7 +540,7 @@ class Slack(AbstractGeometricContact, AbstractPointPair):
     length: fields.Number = fields.length(sign="positive")
     path_kind: ClassVar[PathKind] = "cord"
 
-    def slack(self, space, poses):
+    def excess_length(self, space, poses):
         return self.length - norm(separation(space, self, poses))
 
     def gap(self, space, poses):

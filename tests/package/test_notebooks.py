@@ -26,6 +26,9 @@ FORBIDDEN = re.compile(
 )
 # A formula whose backslashes are doubled is shown as it is written.
 DOUBLED = re.compile(r"\$[^$]*\\\\[a-zA-Z,;][^$]*\$")
+# The machine is drawn by the package; a notebook is named by a link.
+MACHINE = re.compile(r"viz\.(plot_scene|plot_mechanism|show)\(")
+UNLINKED = re.compile(r"`\d\d_\w+`")
 COMMAND = re.compile(r"`jaxmb\s+(\w+)")
 COMMANDS = set(parser()._subparsers._group_actions[0].choices)  # pyright: ignore
 
@@ -42,6 +45,7 @@ def test_lint(path):
     first = next(cell.source for cell in notebook.cells if cell.cell_type == "code").splitlines()
     assert first[-1] == "mb.setup()"
     assert notebook.metadata.kernelspec.name == "python3"
+    assert any(MACHINE.search(cell.source) for cell in notebook.cells if cell.cell_type == "code")
     for cell in notebook.cells:
         texts = [cell.source]
         for output in cell.get("outputs", []):
@@ -51,6 +55,7 @@ def test_lint(path):
             assert not FORBIDDEN.search(text), f"{path.name}: {FORBIDDEN.search(text)!r}"
         if cell.cell_type == "markdown":
             assert not DOUBLED.search(cell.source), f"{path.name}: {DOUBLED.search(cell.source)!r}"
+            assert not UNLINKED.search(cell.source), f"{path.name}: {UNLINKED.search(cell.source)!r}"
             assert set(COMMAND.findall(cell.source)) <= COMMANDS, path.name
 
 

@@ -91,6 +91,20 @@ def test_plot_scene_of_joints_whose_points_need_not_meet():
     assert y[1] > y[0] and abs(x[1] - x[0]) < 0.2 * (y[1] - y[0])
 
 
+def test_plot_scene_of_parts_without_numbers_and_with_any_name_of_a_number():
+    """The driver's angle is a function, and its points are the defaults; the gear has a number of the name `slack`."""
+    scene = mb.Scene(
+        [bar("crank", 1.0, (0.5, 0.0), 0.0)],
+        joints=[
+            planar.Revolute("A", "ground", "crank", point_a=(0.0, 0.0), point_b=(-0.5, 0.0)),
+            planar.Driver("turn", "ground", "crank", quantity="angle", motion=lambda t, p: 2.0 * t),
+        ],
+        forces=[planar.DraftGear("gear", "ground", "crank", stiffness=1e5, preload=10.0, slack=0.02, unloading=0.4)],
+    )
+    texts, gaps, title = read(viz.plot_scene(scene))
+    assert {"crank", "A", "gear"} <= texts and gaps == [] and title == "all joints are closed"
+
+
 def test_plot_scene_refuses_what_it_cannot_draw():
     scene = four_bar()
     with pytest.raises(ValueError, match=r"at the poses of its bodies; a state needs a compiled system"):
