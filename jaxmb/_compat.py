@@ -59,6 +59,8 @@ ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
 # reverse mode. (custom_jvp_call and custom_vjp_call, 0.9 and 0.10.)
 REVERSE = "bwd"
 RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
+# The parameter of equations of functions with rules for batches. (custom_vmap_call, 0.9 to 0.12.)
+BATCH_RULE = "rule"
 # A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
 jaxpr_as_function = core.jaxpr_as_fun
 

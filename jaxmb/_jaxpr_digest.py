@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of, settings_of
+from ._compat import BATCH_RULE, REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of, settings_of
 from ._traced_functions import is_installed, is_of_jax
 
 _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
@@ -25,12 +25,14 @@ class Digest(NamedTuple):
 
     **Fields:** `value`: the same in every process; `unknown`: functions of the user that the program calls from Python,
     and objects of the user's classes, or that only their address distinguishes. The hash contains their names.
-    `operations`: all operations of the program.
+    `operations` of the program; whether an operation `calls` functions of packages, besides rules of derivatives and
+    batches: the hash contains their names.
     """
 
     value: bytes
     unknown: tuple[Any, ...]
     operations: frozenset[Any]
+    calls: bool
 
 
 def digest_of(value: Any, *, rules: bool) -> Digest:
@@ -44,20 +46,22 @@ def digest_of(value: Any, *, rules: bool) -> Digest:
     text = _hashed(digest.of(value))
     if rules and digest.rules:
         text = _hashed(["rules", text, digest.of_derivative(value)])
-    return Digest(text, tuple(digest.unknown), frozenset(digest.operations))
+    return Digest(text, tuple(digest.unknown), frozenset(digest.operations), digest.calls)
 
 
 class _Digest:
     """Texts of programs and their parameters, of which a hash is made: plain values, tuples of texts, and lists that
     begin with the name of a type.
 
-    **Fields:** `rules`: the names of the derivative rules of the equations; `unknown` and `operations` of the `Digest`.
+    **Fields:** `rules`: the names of the derivative rules of the equations; `unknown`, `operations` and `calls` of the
+    `Digest`.
     """
 
     def __init__(self):
         self.unknown: list[Any] = []
         self.rules: set[str] = set()
         self.operations: set[Any] = set()
+        self.calls = False
         # Values that occur several times. Each text keeps its value, so that no other value gets its address.
         self._done: dict[int, tuple[Any, Any]] = {}
         self._contexts: dict[tuple[int, ...], str] = {}
@@ -72,6 +76,8 @@ class _Digest:
             return value
         if kind is tuple:
             return tuple([x if type(x) in _PLAIN else self.of(x) for x in value])
+        if kind is types.FunctionType:
+            return self._function(value)
         if id(value) not in self._done:
             self._done[id(value)] = value, self._text(value, kind)
         return self._done[id(value)][1]
@@ -98,8 +104,6 @@ class _Digest:
             return [name, self.of(value.func), self.of(value.args), self.of(value.keywords)]
         if isinstance(value, types.MethodType):
             return [name, self.of(value.__func__), self.of(value.__self__)]
-        if isinstance(value, types.FunctionType):
-            return self._function(value)
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             fields = [(entry.name, getattr(value, entry.name, None)) for entry in dataclasses.fields(value)]
             return [name, *map(self.of, fields)]
@@ -126,6 +130,10 @@ class _Digest:
             for name, value in sorted(equation.params.items()):
                 if name in RULES:
                     self.rules.add(name)
+                elif name == BATCH_RULE:
+                    rule = _Digest()
+                    parts += [name, rule.of(value)]
+                    self.unknown += rule.unknown
                 elif hasattr(value, "program_of"):
                     operands = [like_of(v.aval) for v in equation.invars]
                     parts += [name, self.of(value.program_of(operands))]
@@ -184,6 +192,7 @@ class _Digest:
         if not is_installed(function.__code__.co_filename):
             self.unknown.append(function)
             return ["function", name]
+        self.calls = True
         if id(function) in self._functions or is_of_jax(function.__module__):
             return ["function", name]
         self._functions[id(function)] = function

@@ -37,6 +37,8 @@ _FEWEST = 100
 _CHECK = hashlib.sha256().digest_size
 # Packages of which the lowered text depends on more than the trace.
 _PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "numpy")
+# How names of files begin.
+TRACE = "trace"
 # The executables of traces by the settings of the call, None where JAX has lowered the trace.
 _executables: weakref.WeakKeyDictionary[Any, dict[Any, Any]] = weakref.WeakKeyDictionary()
 
@@ -83,9 +85,11 @@ def _noted(compile: Callable[[], Any]) -> tuple[Any, tuple[KeptPrograms, str] | 
 def _key(program: Any, call: dict[str, Any], surroundings: bytes) -> str | None:
     """The name of a program on disk; None if its lowered text may depend on code or objects of the user."""
     digest = digest_of((program, call), rules=False)
-    if digest.unknown or not all(map(_is_lowered_by_packages, digest.operations)):
+    lowered = list(map(_lowered_by, digest.operations))
+    if digest.unknown or digest.calls or None in lowered:
         return None
-    return f"jaxmb-{hashlib.sha256(surroundings + digest.value).hexdigest()}"
+    text = [surroundings, digest.value, sorted(filter(None, lowered))]
+    return f"{TRACE}-{hashlib.sha256(marshal.dumps(text, 2)).hexdigest()}"
 
 
 def _read(store: KeptPrograms, key: str) -> Any:
@@ -143,15 +147,15 @@ def _flags() -> tuple[str, ...]:
 
 
 @functools.cache
-def _is_lowered_by_packages(operation: Any) -> bool:
-    """Whether an operation is lowered by JAX, by packages that compute with it, or by this package."""
+def _lowered_by(operation: Any) -> tuple[str, ...] | None:
+    """The names of the functions that lower an operation, after its name; None unless all are of JAX, of packages that
+    compute with it, or of this package.
+    """
     rule = lowering_of(operation, jax.default_backend())
-    return rule is not None and all(map(_is_of_packages, _reached(rule)))
-
-
-def _is_of_packages(function: Any) -> bool:
-    kind = function if isinstance(function, types.FunctionType | type) else type(function)
-    return is_of_jax(kind.__module__) or kind.__module__ == "builtins"
+    kinds = [x if isinstance(x, types.FunctionType | type) else type(x) for x in _reached(rule)]
+    if not kinds or not all(is_of_jax(x.__module__) or x.__module__ == "builtins" for x in kinds):
+        return None
+    return operation.name, *(f"{x.__module__}.{x.__qualname__}" for x in kinds)
 
 
 def _reached(rule: Any) -> Iterable[Any]:

@@ -174,13 +174,21 @@ def test_what_python_computes_is_compiled_anew(folder, found):
     for make in (of_operation, of_callback):
         for factor in (2.0, 3.0):
             np.testing.assert_allclose(jax.jit(make(factor))(X), np.sin(factor * X + 1.0) * X + np.cos(X), rtol=1e-14)
+    # A function of a package as a parameter is known by its name alone.
+    of_function = Primitive("of_function")
+    of_function.def_abstract_eval(lambda x, **_: ShapedArray((), x.dtype))
+    mlir.register_lowering(of_function, mlir.lower_fun(lax.reduce, multiple_results=False))
+    reduced = lambda x: (
+        of_function.bind(jnp.sin(x) * x + x, init_values=1.0, computation=lax.mul, dimensions=(0,)) + 1.0
+    )
+    np.testing.assert_allclose(jax.jit(reduced)(X), np.prod(np.sin(X) * X + X) + 1.0, rtol=1e-14)
     assert found == []
-    # A function of a package is known by its name, and called all the same.
+    # A callback to a package is known too, and called all the same.
     like = jax.ShapeDtypeStruct((3,), float)
     for _ in range(2):
         of_package = jax.jit(lambda x: jnp.sin(jax.pure_callback(np.cbrt, like, x) + 1.0) * x + jnp.cos(x))
         np.testing.assert_allclose(of_package(X), np.sin(np.cbrt(X) + 1.0) * X + np.cos(X), rtol=1e-14)
-    assert not any(found) and not list(folder.glob("jaxmb-*"))
+    assert not any(found) and not list(folder.glob("trace-*"))
 
 
 def test_programs_for_a_device_are_left_to_jax(found):
@@ -194,7 +202,7 @@ def test_programs_for_a_device_are_left_to_jax(found):
 @pytest.mark.filterwarnings("error")
 def test_files_that_cannot_be_read_are_replaced_in_silence(folder, found):
     run({}, found)
-    (place,) = folder.glob("jaxmb-*-cache")
+    (place,) = folder.glob("trace-*-cache")
     whole = place.read_bytes()
     with_check = lambda text: hashlib.sha256(text).digest() + text
     flipped = bytes([*whole[:-9], whole[-9] ^ 1, *whole[-8:]])
@@ -254,4 +262,4 @@ def test_another_store_keeps_no_traces(folder, found, monkeypatch):
     of_jax.reset_cache()
     function, of_numpy = program()
     np.testing.assert_allclose(jax.jit(function)(X)[0], of_numpy(X)[0], rtol=1e-14)
-    assert found == [] and list(folder.glob("jit_function*")) and not list(folder.glob("jaxmb-*"))
+    assert found == [] and list(folder.glob("jit_function*")) and not list(folder.glob("trace-*"))
