@@ -32,7 +32,7 @@ from ._jaxpr_digest import digest_of, held_by
 from ._kept_programs import KeptPrograms, asked
 from ._traced_functions import is_of_jax
 
-# Programs of fewer equations are lowered as quickly as found.
+# Programs of fewer equations, without linear maps, are lowered as quickly as found.
 _FEWEST = 100
 _CHECK = hashlib.sha256().digest_size
 # Packages of which the lowered text depends on more than the trace.
@@ -117,6 +117,8 @@ def _has_many_equations(program: Any) -> bool:
         value = waiting.pop()
         if isinstance(value, tuple):
             waiting += value
+        elif hasattr(value, "program_of"):
+            return True
         elif hasattr(value, "eqns"):
             count += len(value.eqns)
             waiting += [x for equation in value.eqns for x in equation.params.values()]
