@@ -85,8 +85,10 @@ class SceneCatalogue(Catalogue):
         return applied_wrenches(self.system, place, ts, ys, multipliers)
 
     def picture(self, ts, ys, deformation=1.0):
-        acting = (*self.system.constraints.groups, *self.system.forces.groups)
-        return picture(self.system, [g.group for g in acting], ts, ys, deformation)
+        acting = [g.group for g in (*self.system.constraints.groups, *self.system.forces.groups)]
+        names = {name for group in acting for name in group.names}
+        tendons = [g.group for g in self.system.bodies.tendons if names.isdisjoint(g.group.names)]
+        return picture(self.system, [*acting, *tendons], ts, ys, deformation)
 
     def limits(self, t, q):
         space, poses, out = self.system.layout.space, np.asarray(self.system.bodies.prepared_poses(q)), []

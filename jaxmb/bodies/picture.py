@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import State
-from ..parts.base import GROUND
+from ..linalg.rotations import rotation_matrix
+from ..parts.base import GROUND, AbstractLink
+from ..parts.shapes import ring, wheel
 from ..system.picture import Anchors, Line, Picture, in_space
 from .groups import FrameGroup, Group
 
@@ -35,20 +37,27 @@ def picture(
         parts.setdefault(
             name, Anchors(bodies, tuple(None if p is None else np.asarray(space.in_space(p)) for p in points))
         )
+    for name, body, place in _frames_on(system, body_names):
+        parts.setdefault(name, Anchors((body,), (place,)))
     width = _width(float(system.length), parts, {name: at[0] for name, at in positions.items()}, owners)
+    followed = [of_part for group in groups for of_part in _followed(system, group, ts, ys)]
     shapes = [
         (GROUND if k is None else bodies[k], shape)
-        for _, bodies, part in single
-        for k, shape in _shapes(part, space, width)
+        for (_, bodies, part), along in zip(single, followed, strict=True)
+        for k, shape in _shapes(part, space, width, along)
+    ]
+    shapes += [
+        gear for _, bodies, part in single for gear in _gears(part, bodies, parts, positions, orientations, width)
     ]
     # The friction of a joint acts where the joint does.
     of_laws = {law: joint for g in system.constraints.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
     if not system.spatial:
         moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
+    up = _up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity))
     return Picture(
         planar=not system.spatial,
-        up=_up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity)),
+        up=up,
         width=width,
         positions=positions,
         orientations=orientations,
@@ -56,7 +65,7 @@ def picture(
         owners=owners,
         parts=parts | {law: parts[joint] for law, joint in of_laws.items()},
         shapes=shapes,
-        paths={name: path for group in groups for name, path in _paths(system, group, ts, ys).items()} | lines,
+        paths={name: path for group in groups for name, path in _paths(system, group, ts, ys, up).items()} | lines,
         centres={
             name: np.asarray(space.in_space(centre)) for g in system.bodies.groups for name, centre in _centres(g.group)
         },
@@ -74,11 +83,38 @@ def _pictured(group):
     return eqx.tree_at(lambda stacked: stacked.part, group, jax.tree.map(kept, group.part, moved))
 
 
-def _shapes(part, space, width):
+def _shapes(part, space, width, followed):
     """The shapes of a part in the frames of their bodies, each with the index of its body within the part."""
-    for k, shape in part.shapes(space, width):
+    along = () if followed is None else part.shapes_along(space, width, followed)
+    for k, shape in (*part.shapes(space, width), *along):
         frame = part.body_frames.get(str(k))
         yield k, shape if frame is None else shape.moved(*space.placement(frame.pose_in_body(space)))
+
+
+def _gears(part, bodies, parts, positions, orientations, width):
+    """The wheels of a pair of gears about their axes, with the names of their bodies."""
+    if part.pitch_radii(1.0) is None:
+        return
+    gears = bodies[:2]
+    axes: list[Any] = [_axis(name, {*bodies} - {name}, parts) for name in gears]
+    if any(axis is None for axis in axes):
+        return
+    first, second = (
+        positions[name][0] + rotation_matrix(orientations[name][0]) @ axis
+        for name, axis in zip(gears, axes, strict=True)
+    )
+    distance = float(np.linalg.norm(second - first))
+    for name, axis, radius in zip(gears, axes, part.pitch_radii(distance), strict=True):
+        if distance > 0:
+            gear = wheel(radius, 2.4 * width, axis) if radius > 0 else ring(-radius, 2.4 * width, axis)
+            yield from ((name, shape) for shape in gear)
+
+
+def _axis(name, others, parts):
+    """The point of a gear at its axis: of a joint with another body of the pair, or else the mass centre."""
+    shared = [part for part in parts.values() if name in part.bodies and others & {*part.bodies}]
+    points = [part.points[part.bodies.index(name)] for part in shared]
+    return next((point for point in points if point is not None), None if name == GROUND else np.zeros(3))
 
 
 def _centres(group):
@@ -107,6 +143,18 @@ def _flexible_frames(system):
     return [g.group for g in system.frames if g.group.part.is_flexible]
 
 
+def _frames_on(system, body_names):
+    """Names, bodies and places of frames that are fixed in their bodies."""
+    for group in (g.group for g in system.frames if not g.group.part.is_flexible):
+        for k, (name, (body, *_)) in enumerate(zip(group.names, group.bodies, strict=True)):
+            frame = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group.part)
+            yield (
+                name,
+                body_names[body],
+                np.asarray(system.layout.space.placement(frame.pose_in_body(system.layout.space))[0]),
+            )
+
+
 def _width(length, parts, places, owners):
     """The radius of a bar, from the sizes of the system and of a typical body; of points, from their distances."""
     reach: dict[str, float] = {}
@@ -123,12 +171,33 @@ def _width(length, parts, places, owners):
     return min(0.024 * length, 0.08 * typical)
 
 
-def _paths(system, group, ts, ys) -> dict[str, Line]:
-    lines = _world_paths(system, group, ts, ys)
+def _paths(system, group, ts, ys, up) -> dict[str, Line]:
+    lines, slack = (_world_values(system, group, hook, ts, ys) for hook in ("path", "slack"))
     if lines is None:
         return {}
     lines = in_space(lines)
-    return {name: Line(group.part.path_kind or "rod", lines[:, k]) for k, name in enumerate(group.names)}
+    drawn = lambda k: lines[:, k] if slack is None else _hanging(lines[:, k], np.asarray(slack)[:, k], up)
+    return {name: Line(group.part.path_kind or "rod", drawn(k)) for k, name in enumerate(group.names)}
+
+
+def _followed(system, group, ts, ys):
+    """For each part what it follows along the motion, or None."""
+    values = _world_values(system, group, "followed", ts, ys)
+    return [None] * len(group.names) if values is None else np.asarray(values).swapaxes(0, 1)
+
+
+def _hanging(ends, slack, up):
+    """Cords with two ends, shape (times, 2, 3), that are longer than their distance by `slack` [m], as parabolas."""
+    share = np.linspace(0.0, 1.0, 25)[:, None]
+    straight = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])
+    hung = lambda sag: straight - 4 * sag[:, None, None] * share * (1 - share) * up
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) + np.maximum(slack, 0.0)
+    low, high = np.zeros_like(length), length
+    for _ in range(40):
+        sag = 0.5 * (low + high)
+        longer = np.sum(np.linalg.norm(np.diff(hung(sag), axis=1), axis=2), axis=1) > length
+        low, high = np.where(longer, low, sag), np.where(longer, sag, high)
+    return hung(np.where(slack > 0, low, 0.0))
 
 
 def _places(system, ts, ys, owners, held, deformation):
@@ -183,14 +252,20 @@ def _placements(system, ts, q):
     return jax.vmap(at_time)(ts, q)
 
 
-@eqx.filter_jit
-def _world_paths(system, group, ts, ys):
-    """World points of the parts' lines, shape (times, parts, points, d); None without lines."""
+def _world_values(system, group, hook, ts, ys):
+    """What a hook of the parts gives along the motion, shape (times, parts, …); None if they have no such hook."""
+    is_inherited = getattr(type(group.part), hook) is getattr(AbstractLink, hook)
+    if is_inherited and (hook != "path" or group.part.path_kind is None):
+        return None
+    return _values_along(system, group, hook, ts, ys)
 
+
+@eqx.filter_jit
+def _values_along(system, group, hook, ts, ys):
     def at_time(t, y):
         poses = group.gather(system.bodies.prepared_poses(y.q))
         space = system.layout.space
-        return group.map(lambda at, x: at(t).path(space, at(t).seen_poses(space, x)), poses)
+        return group.map(lambda at, x: getattr(at(t), hook)(space, at(t).seen_poses(space, x)), poses)
 
     return jax.vmap(at_time)(ts, ys)
 

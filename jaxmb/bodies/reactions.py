@@ -75,7 +75,9 @@ def _tension_measures(system) -> dict[str, Measure]:
             spans = group.group.part.sides
             shape = () if spans == 1 else (spans,)
             for k, name in enumerate(group.group.names):
-                out[f"{name}.tension"] = Measure(shape, _tension, (g, shape, np.array(k)), of_forces=True)
+                out[f"{name}.tension"] = Measure(
+                    shape, _tension, (g, shape, np.array(k)), of_forces=True, of_spans=True
+                )
     return out
 
 

@@ -21,7 +21,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Returns:** the exit code: 0; or, with a message on stderr, 1 if a simulation failed or a file could not be
     written, 2 for an invalid name or value, and 130 after Ctrl-C. Errors in a user's file have their tracebacks.
     """
-    arguments = parser().parse_args(argv)
+    arguments = (commands := parser()).parse_args(argv)
+    if arguments.command is None:
+        commands.print_help()
+        return 0
     _prepare()
     try:
         arguments.command(arguments)
@@ -50,7 +53,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="Compiled programs are kept in the user's cache folder for later runs; the environment variable "
         f"{VARIABLE} names another folder, or is off. `jaxmb doctor` shows the folder.",
     )
-    commands = out.add_subparsers(required=True, metavar="command")
+    out.set_defaults(command=None)
+    commands = out.add_subparsers(metavar="command")
     commands.add_parser("mechanisms", help="list the mechanisms of the library").set_defaults(command=_mechanisms)
     for command in (run, sweep, doctor, help):
         command.add_to(commands)

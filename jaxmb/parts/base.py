@@ -43,7 +43,7 @@ Wrenches = Float[Array, "k v"]
 GROUND = "ground"
 
 # How a picture draws the line of a part.
-PathKind = Literal["rod", "coil", "belt", "bar"]
+PathKind = Literal["rod", "coil", "belt", "cord", "bar"]
 # The quantity of each coordinate by name: an angle [rad], a rotation vector [rad] or a length [m].
 Quantities = Mapping[str, Literal["angle", "rotation", "length"]]
 
@@ -648,10 +648,36 @@ class AbstractLink(AbstractActor):
     def path(self, space: AbstractSpace, poses: Poses) -> Float[Array, "points d"] | None:
         """Hook: the world points [m] of the line by which a picture shows the part; None without a line.
 
-        By `path_kind`, `"rod"` (also for None) and `"coil"` have two points; `"bar"` is a line, as thick as a body, and
-        `"belt"` a closed line, through any number of points.
+        By `path_kind`, `"rod"` (also for None) and `"coil"` have two points; `"bar"` is a line, as thick as a body,
+        `"cord"` a line and `"belt"` a closed line, through any number of points.
         """
         return None if self.path_kind is None else both_points(space, self, poses)
+
+    def slack(self, space: AbstractSpace, poses: Poses) -> Scalar | None:
+        """Hook: how much longer [m] the part is than its `path` of two points, between which a picture lets it hang."""
+        del space, poses
+        return None
+
+    def followed(self, space: AbstractSpace, poses: Poses) -> Array | None:
+        """Hook: a place or length [m] along a motion, which `shapes_along` takes; None without such shapes."""
+        del space, poses
+        return None
+
+    def shapes_along(
+        self, space: AbstractSpace, size: float, followed: Float[np.ndarray, "times ..."]
+    ) -> tuple[tuple[int, AbstractShape], ...]:
+        """Hook: further `shapes`, as large as a motion needs; arguments as of `shapes`, and what is `followed` at its
+        times.
+        """
+        del space, size, followed
+        return ()
+
+    def pitch_radii(self, distance: float) -> tuple[float, float] | None:
+        """Hook: the pitch radii [m] of two gears, `bodies[:2]`, from the distance of their axes; None of other parts.
+        The last body holds their axes; of an internal mesh one radius is negative, and its gear a ring.
+        """
+        del distance
+        return None
 
 
 class AbstractPair(AbstractLink):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._types import VectorLike
 from ..linalg.rotations import norm
 from . import fields
-from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, ScalarCoordinate
+from .base import AbstractConstraint, AbstractInertialConstraint, AbstractTendon, PathKind, ScalarCoordinate
 from .coordinate_parts import AbstractOfCoordinates, shortest, turns
 
 # An angle [rad] this near to half a turn is there.
@@ -266,6 +266,7 @@ class Tendon(AbstractTendon):
     bodies: fields.Names = fields.body_names()
     owners: tuple[int, ...] = eqx.field(static=True, default=())
     points: fields.Number = fields.parameter(shape=None, unit="m", kw_only=False)
+    path_kind: ClassVar[PathKind] = "cord"
 
     def __init__(self, name: str, path: Sequence[tuple[str, VectorLike]]):
         self.name = name
@@ -290,6 +291,9 @@ class Tendon(AbstractTendon):
     def length(self, space, poses):
         return jnp.sum(self._distances(space, poses))
 
+    def path(self, space, poses):
+        return jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+
     def _distances(self, space, poses):
-        points = jax.vmap(space.point)(poses[np.array(self.owners)], self.points)
+        points = self.path(space, poses)
         return norm(points[1:] - points[:-1])

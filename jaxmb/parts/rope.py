@@ -117,7 +117,7 @@ class AbstractRope(AbstractLink):
     bearings: fields.Number = fields.parameter(shape=(None,), unit="rad", optional=True)
     marks: fields.Number = fields.parameter(shape=(None,), unit="rad", optional=True)
     quantities: ClassVar[Quantities] = {"length": "length", "wrap": "angle"}
-    path_kind: ClassVar[PathKind] = "belt"
+    path_kind: ClassVar[PathKind] = "cord"
     has_limits: ClassVar[bool] = True
 
     @property
@@ -377,9 +377,7 @@ class AbstractRope(AbstractLink):
             side = quarter_turn(e) if axis is None else cross(axis[None], e)
             arc = centres[k][None] - sense * next(radii) * (jnp.cos(turned) * side - jnp.sin(turned) * e)
             out.append(jnp.where(angle > 0, arc, out[-1][-1:]) if self.lifts[k] else arc)
-        # There and back, since a belt is a closed line.
-        there = jnp.concatenate(out)
-        return jnp.concatenate([there, there[-2:0:-1]])
+        return jnp.concatenate(out)
 
     def shapes(self, space, size):
         if self.radii is None:

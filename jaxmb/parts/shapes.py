@@ -161,14 +161,16 @@ class Cylinder(AbstractShape):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mesh(AbstractShape):
-    """A surface of triangles; `Mesh.read` reads one from a file.
+    """A surface of triangles; `Mesh.read` reads one from a file, `Mesh.plate` has an outline.
 
     **Arguments:** `vertices` [m], shape (n, 3), in the shape's axes; `faces`, shape (m, 3): the vertices of each
-    triangle, counter-clockwise seen from outside.
+    triangle, counter-clockwise seen from outside; `outline` [m], shape (k, 3), in a figure of the plane, default the
+    convex hull.
     """
 
     vertices: Any
     faces: Any
+    outline: Any = None
     primitive = "own"
 
     def __post_init__(self):
@@ -182,10 +184,44 @@ class Mesh(AbstractShape):
             raise ValueError("Mesh: vertices must be finite, and faces must be indices of vertices.")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+        if self.outline is not None:
+            object.__setattr__(self, "outline", np.asarray(self.outline, float))
 
     @property
     def scale(self):
         return np.ones(3)
+
+    @classmethod
+    def plate(cls, outer: Any, thickness: float, *, inner: Any = None, **place: Any) -> "Mesh":
+        """A plate about z = 0, or a ring.
+
+        **Arguments:** `outer` [m], shape (n, 2): the corners of its outline, counter-clockwise, all of which are seen
+        from their mean; `thickness` [m]; `inner` [m], shape (n, 2): the corners of the hole of a ring, one for each;
+        `position`, `orientation` and `color` as for all shapes.
+        """
+        outer = np.asarray(outer, float)
+        inner, n = np.broadcast_to(outer.mean(axis=0), outer.shape) if inner is None else np.asarray(inner), len(outer)
+        layer = lambda points, z: np.column_stack([points, np.full(n, z)])
+        rims = [
+            layer(points, z * thickness) for points, z in ((outer, 0.5), (outer, -0.5), (inner, -0.5), (inner, 0.5))
+        ]
+        k, ahead = np.arange(n), np.roll(np.arange(n), -1)
+        # Around the section of the plate: outside, back, hole and front.
+        faces = [
+            corners
+            for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))
+            for corners in (
+                np.stack([a * n + k, b * n + k, a * n + ahead], 1),
+                np.stack([a * n + ahead, b * n + k, b * n + ahead], 1),
+            )
+        ]
+        closed = lambda points: layer(points, 0.0)[[*range(n), 0]]
+        outline = (
+            layer(outer, 0.0)
+            if np.ptp(inner, axis=0).max() == 0
+            else np.concatenate([closed(outer), closed(inner)[::-1]])
+        )
+        return cls(np.concatenate(rims), np.concatenate(faces), outline, **place)
 
     @classmethod
     def read(cls, path: str | Path, *, scale: VectorLike = 1.0, **place: Any) -> "Mesh":
@@ -261,8 +297,17 @@ def wheel(
     """
     width, turn = radius / 3 if width is None else width, along(axis)
     disc = Cylinder(radius, width, position=position, orientation=turn)
-    spoke = Box((1.9 * radius, 0.14 * radius, 1.1 * width), position=position, orientation=turn, color=DARK)
+    spoke = Box((1.9 * radius, 0.08 * radius, 1.1 * width), position=position, orientation=turn, color=DARK)
     return disc, spoke
+
+
+def ring(radius: float, width: float, position: VectorLike) -> tuple[AbstractShape, ...]:
+    """A gear with internal teeth in the plane: a ring around its pitch circle, with a mark that shows how it turns."""
+    angle = np.linspace(0.0, 2 * np.pi, 73)[:-1]
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x, y, _ = place = np.asarray(position, float)
+    mark = Box((0.08 * radius, 0.08 * radius, 1.1 * width), position=(x + 1.04 * radius, y, 0.0), color=DARK)
+    return Mesh.plate(1.08 * radius * circle, width, inner=radius * circle, position=place), mark
 
 
 def marked_ball(radius: float, position: VectorLike = (0.0, 0.0, 0.0)) -> tuple[AbstractShape, ...]:

@@ -538,7 +538,10 @@ class Slack(AbstractGeometricContact, AbstractPointPair):
     """
 
     length: fields.Number = fields.length(sign="positive")
-    path_kind: ClassVar[PathKind] = "rod"
+    path_kind: ClassVar[PathKind] = "cord"
+
+    def slack(self, space, poses):
+        return self.length - norm(separation(space, self, poses))
 
     def gap(self, space, poses):
         d = separation(space, self, poses)

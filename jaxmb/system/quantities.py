@@ -32,25 +32,29 @@ class Quantity(NamedTuple):
     """A quantity of a motion, such as the position of a body or the force of a joint.
 
     **Fields:** `shape` at one time; `value(ts, ys, solved)`: values along a motion, axis 0 is time; `of_forces`:
-    whether the values depend on the accelerations or multipliers in `solved`, which is None otherwise.
+    whether the values depend on the accelerations or multipliers in `solved`, which is None otherwise; `of_spans`:
+    whether its components belong to the spans of a rope.
     """
 
     shape: tuple[int, ...]
     value: Callable[[Any, Any, Any], Array]
     of_forces: bool = False
+    of_spans: bool = False
 
 
 class Measure(NamedTuple):
     """A quantity of all systems of one structure.
 
     **Fields:** `shape` at one time; `view(system, place, ts, ys, solved)`, made by `view_of_motion`; `place`: static
-    values that choose a quantity of the view, and the indices of the part as arrays; `of_forces` as in `Quantity`.
+    values that choose a quantity of the view, and the indices of the part as arrays; `of_forces` and `of_spans` as in
+    `Quantity`.
     """
 
     shape: tuple[int, ...]
     view: Callable[..., Array]
     place: Any
     of_forces: bool = False
+    of_spans: bool = False
 
 
 class Quantities(Mapping[str, Quantity]):
@@ -60,8 +64,8 @@ class Quantities(Mapping[str, Quantity]):
         self._system, self._measures = system, measures
 
     def __getitem__(self, name: str) -> Quantity:
-        shape, view, place, of_forces = self._measures[name]
-        return Quantity(shape, functools.partial(view, self._system, place), of_forces)
+        shape, view, place, *kind = self._measures[name]
+        return Quantity(shape, functools.partial(view, self._system, place), *kind)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._measures)

@@ -87,7 +87,8 @@ def explore(
 
 def curves(motion: Trajectory, names: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
     """The components of quantities along a motion, by name and label."""
-    values = {name: components("", motion.quantity(name)) for name in names}
+    of_spans = lambda name: motion.system.quantities()[name].of_spans
+    values = {name: components("", motion.quantity(name), of_spans(name)) for name in names}
     return {name: {label: column for label, column, _ in of_name} for name, of_name in values.items()}
 
 

@@ -26,12 +26,13 @@ _LONG = 0.1
 
 
 class Curve(NamedTuple):
-    """A curve of a panel; `color` and `style` as matplotlib takes them."""
+    """A curve of a panel; `color` and `style` as matplotlib takes them; `held`: constant between times."""
 
     label: str
     values: np.ndarray
     color: Any
     style: str = "-"
+    held: bool = False
 
 
 class Panel(NamedTuple):
@@ -62,9 +63,11 @@ def color(k: int) -> tuple[float, ...]:
 
 
 def colors_of(names: Iterable[str], bodies: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """Colours by name: of a body as in all pictures of its scene, of other names those that are left."""
+    """Colours by name: of a body and its quantities as in all pictures of its scene, of other names those that are
+    left.
+    """
     names = dict.fromkeys(names)
-    out = {name: color(bodies.index(name)) for name in names if name in bodies}
+    out = {name: color(bodies.index(body)) for name in names if (body := name.split(".")[0]) in bodies}
     left = [x for x in map(color, range(len(COLORS))) if x not in out.values()] or list(map(color, range(len(COLORS))))
     others = [name for name in names if name not in out]
     return out | {name: left[k % len(left)] for k, name in enumerate(others)}
@@ -88,8 +91,9 @@ def empty_panels(count: int, xlabel: str = "t [s]") -> tuple["Figure", list["Axe
 def draw(axes: "Axes", panel: Panel, x: Any) -> float:
     """Draw a panel; returns the factor from its unit to the unit that is shown."""
     factor, unit = shown_unit(panel.unit, *(curve.values for curve in panel.curves))
-    for label, values, of_curve, style in panel.curves:
-        axes.plot(x, factor * np.asarray(values), style, color=of_curve, linewidth=1.4, label=label)
+    for label, values, of_curve, style, held in panel.curves:
+        steps: Any = "steps-post" if held else "default"
+        axes.plot(x, factor * np.asarray(values), style, color=of_curve, linewidth=1.4, label=label, drawstyle=steps)
     finish_panel(axes, with_unit(panel.label, unit))
     return factor
 
@@ -161,12 +165,13 @@ def check_single(ts: Any) -> None:
         )
 
 
-def components(name: str, values: Any) -> list[tuple[str, np.ndarray, str]]:
+def components(name: str, values: Any, of_spans: bool = False) -> list[tuple[str, np.ndarray, str]]:
     """The components of a quantity along axis 0: labels, values and styles of lines."""
     table = np.asarray(values).reshape(len(values), -1)
-    return [(name + component(k, table.shape[1]), table[:, k], STYLES[k % len(STYLES)]) for k in range(table.shape[1])]
+    words = [component(k, of_spans) if table.shape[1] > 1 else "" for k in range(table.shape[1])]
+    return [(name + word, table[:, k], STYLES[k % len(STYLES)]) for k, word in enumerate(words)]
 
 
-def component(k: int, count: int = 2) -> str:
-    """The word for a component of a vector, x, y, z or a number; nothing for the only one."""
-    return "" if count == 1 else f" {'xyz'[k] if k < 3 else k + 1}"
+def component(k: int, of_spans: bool = False) -> str:
+    """The word for a component of a vector, x, y, z or a number, or for a span of a rope."""
+    return f" span {k + 1}" if of_spans else f" {'xyz'[k] if k < 3 else k + 1}"

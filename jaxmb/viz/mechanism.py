@@ -18,7 +18,7 @@ from ..trajectory import Trajectory, picture_of
 from .figure import color as color_of, new_figure
 from .meshes import heights
 from .one_motion import check_finite, one_motion, poses_of
-from .silhouettes import area, edges, strip, stroke
+from .silhouettes import area, edges, size, strip, stroke
 from .solids import Placed, color_in, solids
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ _TIMES = 6
 # The least width of a picture, relative to its height, and the other way round.
 _THIN = 0.2
 _EDGE: Color = (40, 40, 40)
+# Of a figure in space, in inches: the margin, the height of a title, and the largest height of the axes.
+_PAD, _TITLE, _HIGHEST = 0.12, 0.35, 6.0
 
 
 def plot_mechanism(
@@ -81,9 +83,8 @@ def plot_mechanism(
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")
-    finish(figure, axes, picture, shapes)
     title = "t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s" if len(shown) <= _TIMES else ""
-    axes.set_title("  ·  ".join(filter(None, [title, *picture.notes])), fontsize="medium")
+    finish(figure, axes, picture, shapes, "  ·  ".join(filter(None, [title, *picture.notes])))
     return figure
 
 
@@ -103,9 +104,10 @@ def drawn(picture: Picture, shapes: Sequence[Placed], shown: Sequence[int]) -> t
     return figure, axes
 
 
-def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -> None:
-    """Draw the terrain, and give the axes labels and equal scales; upwards is up in space, too."""
+def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], title: str, **style: Any) -> None:
+    """Draw the terrain, and give the axes labels, equal scales and a title; upwards is up in space, too."""
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    style = {"fontsize": "medium", **style}
     if picture.planar:
         for ground in [shape for _, shape in shapes if shape.primitive == "ground"]:
             _draw_ground(axes, ground)
@@ -115,17 +117,56 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed]) -
         half = np.maximum(size, _THIN * size.max()) / 2
         axes.set(**{name: (x - h, x + h) for name, x, h in zip(("xlim", "ylim"), middle, half, strict=True)})
         figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
+        axes.set_title(title, **style)
     else:
         axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
         axes.set(zlabel="z [m]", aspect="equal")
         sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
-        for name, size in zip("xyz", sizes, strict=True):
-            axes.locator_params(axis=name, nbins=max(1, round(8 * size / sizes.max())), min_n_ticks=1)
+        for k, name in enumerate("xyz"):
+            axes.locator_params(axis=name, nbins=max(1, round(8 * sizes[k] / sizes.max())), min_n_ticks=1)
+            # Distances of labels are relative to the other sides; a label stands beyond the numbers at thin boxes, too.
+            getattr(axes, f"{name}axis").labelpad = 13.5 * sizes.max() / np.delete(sizes, k).max() - 9.5
+        _fill(figure, axes, title, style)
+
+
+def _fill(figure, axes, title, style):
+    """Let the box of axes in space with its labels fill a figure that is as high as they need."""
+    axes.set_in_layout(False)
+    legends = [legend.get_window_extent().width / figure.dpi + _PAD for legend in figure.legends]
+    width, side = figure.get_figwidth() - 2 * _PAD - max(legends, default=0.0), figure.get_figheight()
+    fits = lambda box: min(width / (box[2] - box[0]), _HIGHEST / (box[3] - box[1]))
+    side *= fits(_extents(figure, axes, side))
+    # Words do not grow with the box: a second look.
+    box = _extents(figure, axes, side)
+    side, (left, low, right, high) = side * fits(box), fits(box) * box
+    figure.set_figheight(high - low + 2 * _PAD + _TITLE)
+    size = figure.get_size_inches()
+    place = np.array([_PAD + 0.5 * (width - (right - left)) - left, _PAD - low])
+    axes.set_position([*(place / size), *(side / size)])
+    # The title stands above the box, and in the middle of it.
+    x, y = (_PAD + 0.5 * width - place[0]) / side, (_PAD + high - low + 0.1 - place[1]) / side
+    axes.set_title(title, y=y, **style).set_position((x, y))
+
+
+def _extents(figure, axes, side):
+    """The least x and y, and the largest ones, of the box with its labels [in], if the axes are as wide as `side`."""
+    from matplotlib.transforms import Bbox
+
+    axes.set_position([0.0, 0.0, *(side / figure.get_size_inches())])
+    figure.draw_without_rendering()
+    # The box reaches beyond the limits of its axes.
+    limits = [x + np.ptp(x) / 24 * np.array([-1, 1]) for x in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    corners = axes.transData.transform(flat(axes, np.reshape(np.meshgrid(*limits), (3, -1))))
+    seen = Bbox([corners.min(axis=0), corners.max(axis=0)])
+    labels = [axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+    return np.array(Bbox.union([seen, *labels]).extents) / figure.dpi
 
 
 def _draw_areas(axes, picture, shapes, time, fade):
     areas = [(in_world(picture, body, area(shape), time), shape.color) for body, shape in shapes]
-    for corners, color in sorted(areas, key=lambda polygon: float(np.mean(polygon[0][:, 2]))):
+    # From the back to the front; of one depth, small areas before large ones.
+    order = lambda polygon: (round(polygon[0][0, 2] / picture.width, 3), -size(polygon[0]))
+    for corners, color in sorted(areas, key=order):
         axes.fill(
             *corners[:, :2].T, facecolor=faded(color, fade), edgecolor=faded(_EDGE, fade), linewidth=0.4, zorder=2
         )
@@ -145,7 +186,7 @@ def _draw_paths(axes, picture, time, fade):
                 axes.fill(*corners.T, color=color, linewidth=0.6, zorder=2)
             continue
         points = stroke(line, time, picture.width)[:, : 2 if picture.planar else 3]
-        axes.plot(*points.T, color=color, linewidth=2.0 if line.kind in ("belt", "bar") else 1.0, zorder=2)
+        axes.plot(*points.T, color=color, linewidth=1.0 if line.kind in ("rod", "coil") else 2.0, zorder=2)
 
 
 def _draw_ground(axes, ground):
@@ -157,6 +198,14 @@ def _draw_ground(axes, ground):
     bottom = min(axes.get_ylim()[0], float(line[:, 1].min()) - 0.02 * (high - low))
     axes.fill_between(line[:, 0], line[:, 1], bottom, color=faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
     axes.set(xlim=(low, high), ylim=(bottom, axes.get_ylim()[1]))
+
+
+def flat(axes: Any, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 2"]:
+    """Points of axes in space, as the figure shows them."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    x, y, z = points
+    return np.stack(proj_transform(x, y, z, axes.get_proj())[:2], axis=-1)
 
 
 def in_world(picture: Picture, body: str, points: Float[np.ndarray, "n 3"], time: int) -> Float[np.ndarray, "n 3"]:

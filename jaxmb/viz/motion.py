@@ -41,12 +41,15 @@ _CHECKS = ("energy", "residuals")
 
 
 class _Line(NamedTuple):
-    """A component of a quantity of the part or coordinate `name` along a motion; `component` None for the only one."""
+    """A component of a quantity of the part or coordinate `name` along a motion, with its `word` for a label;
+    `component` None for the only one.
+    """
 
     name: str
     component: int | None
     values: Float[np.ndarray, "times"]
     quantity: str
+    word: str
 
 
 @names_arguments
@@ -146,8 +149,11 @@ def _lines(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[
         # Several angles of a joint have their whole names.
         name = f"{own.part}.{own.field}" if own.field[-2:-1] == "_" else own.part
         values = np.asarray(trajectory.quantity(quantity))
-        columns = values.reshape(values.shape[0], -1).T
-        lines = [_Line(name, None if values.ndim == 1 else k, column, quantity) for k, column in enumerate(columns)]
+        of_spans = trajectory.system.quantities()[quantity].of_spans
+        lines = [
+            _Line(name, k if values.ndim > 1 else None, column, quantity, component(k, of_spans) * (values.ndim > 1))
+            for k, column in enumerate(values.reshape(values.shape[0], -1).T)
+        ]
         out.setdefault(own.unit or own.word, []).extend(lines)
     order = [*_UNITS, *out]
     return dict(sorted(out.items(), key=lambda item: order.index(item[0])))
@@ -185,9 +191,9 @@ def _panels(system, lines: Sequence[_Line]) -> list[Panel]:
     components = sorted({line.component or 0 for line in lines})
     several, out = len(lines) > MOST, []
     for block in _blocks(lines, colors) if several else [lines]:
-        names = [line.name + _component(line) for line in block]
+        names = [line.name + line.word for line in block]
         labels = [
-            name if names.count(name) == 1 else line.quantity + _component(line)
+            name if names.count(name) == 1 else line.quantity + line.word
             for name, line in zip(names, block, strict=True)
         ]
         styles = ["-" if several else STYLES[components.index(line.component or 0) % len(STYLES)] for line in block]
@@ -209,10 +215,6 @@ def _blocks(lines: Sequence[_Line], colors: Mapping[str, Any]) -> list[list[_Lin
                 out.append([])
             out[-1].append(line)
     return out
-
-
-def _component(line: _Line) -> str:
-    return "" if line.component is None else component(line.component)
 
 
 def _draw_events(places: Sequence["Axes"], t: np.ndarray, trajectory: Trajectory) -> None:

@@ -170,8 +170,9 @@ class Motion:
             args = start + offset, orientation, scales, colors
             out.append(stage.instances(f"{prefix}/solids/{kind}s", mesh, *args, grain))
         for name, path in self.picture.paths.items():
-            if path.kind == "belt":
+            if path.kind in ("belt", "cord"):
                 segments = np.stack([path.points, np.roll(path.points, -1, axis=1)], axis=2) + offset
+                segments = segments if path.kind == "belt" else segments[:, :-1]
                 out.append(stage.lines(f"{prefix}/solids/{name}", segments, DARK, 5.0, grain))
         return out
 

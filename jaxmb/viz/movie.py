@@ -106,11 +106,9 @@ def _drawn(picture: Picture, times: np.ndarray, trails: bool) -> Iterator[io.Byt
                 axes.plot(*trail.T, color=faded(color, 1.0), linewidth=0.8, alpha=0.6, zorder=1)
         limits = dict(zip(("xlim", "ylim", "zlim")[:dimension], zip(low, high, strict=True), strict=False))
         axes.set(**limits)
-        finish(figure, axes, picture, shapes)
+        title = "  ·  ".join([f"t = {t - times[0]:.2f} s", *picture.notes])
+        finish(figure, axes, picture, shapes, title, family="monospace")
         axes.set(**limits)
-        axes.set_title(
-            "  ·  ".join([f"t = {t - times[0]:.2f} s", *picture.notes]), fontsize="medium", family="monospace"
-        )
         file = io.BytesIO()
         figure.savefig(file, dpi=_DPI)
         file.seek(0)

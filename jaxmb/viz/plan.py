@@ -15,10 +15,13 @@ def plot(plan: Plan, names: Sequence[str] = ()) -> Any:
     motion, panels = plan.trajectory, []
     colors = colors_of((*plan.controls, *names), motion.system.body_names)
     for name, values in plan.along.items():
-        curves = [Curve(label, x, colors[name], style) for label, x, style in components(name, values)]
+        held = plan.controls[name].interpolation == "held"
+        curves = [Curve(label, x, colors[name], style, held) for label, x, style in components(name, values)]
         panels.append(Panel(*effort(plan.system, name), curves))
-    for name in chosen("quantity", names, plan.system.quantities()) if names else ():
-        curves = [Curve(label, x, colors[name], style) for label, x, style in components(name, motion.quantity(name))]
+    quantities = plan.system.quantities()
+    for name in chosen("quantity", names, quantities) if names else ():
+        of_name = components(name, motion.quantity(name), quantities[name].of_spans)
+        curves = [Curve(label, x, colors[name], style) for label, x, style in of_name]
         panels.append(Panel(*named(plan.system, name)[2:], curves))
     figure, places = empty_panels(len(panels))
     for axes, panel, name in zip(places, panels, (*plan.controls, *names), strict=True):

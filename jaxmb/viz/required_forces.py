@@ -14,7 +14,7 @@ def plot(needed: RequiredForces, names: Sequence[str] = ()) -> Any:
     """As `RequiredForces.plot`."""
     check_single(needed.ts)
     names = chosen("actuator", names, needed.forces)
-    colors, curves = colors_of(names, ()), {}
+    colors, curves = colors_of(names, needed.machine.body_names), {}
     for name in names:
         of_name = [Curve(label, x, colors[name], style) for label, x, style in components(name, needed.forces[name])]
         curves.setdefault(effort(needed.machine, name), []).extend(of_name)

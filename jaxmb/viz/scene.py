@@ -10,7 +10,8 @@ from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
 from ..trajectory import picture_of, still
 from .figure import color as color_of
-from .mechanism import drawn, finish, in_world
+from .mechanism import drawn, finish, flat, in_world
+from .placed_names import Name, place_names
 from .solids import solids
 
 if TYPE_CHECKING:
@@ -58,14 +59,14 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     picture = picture_of(still(system, y, t))
     shapes = solids(picture, {}, None)
     figure, axes = drawn(picture, shapes, [0])
-    dimension = 2 if picture.planar else 3
+    dimension, names = 2 if picture.planar else 3, []
     bodies = picture.bodies
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
     for k, name in enumerate(bodies):
         color, place = color_of(k), picture.positions[name][0, :dimension]
         axes.plot(*place, "o", color=color, markersize=4, zorder=4)
         if len(bodies) <= _NAMES:
-            _write(axes, place, name, color, (0, 7), weight="bold")
+            names.append(Name(name, place, 1, {"color": color, "weight": "bold"}))
     residuals = _residuals(system, t, y)
     least = _OPEN * float(system.length)
     largest = {name: float(np.max(np.abs(values))) for name, values in residuals.items()}
@@ -87,9 +88,12 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
                 text = f"{name}: {np.linalg.norm(gap):.3g} m apart"
                 axes.plot(*np.stack([points[0], points[-1]]).T, color=_RED, linewidth=2, zorder=6)
         if is_open or len(bodies) + len(joints) <= _NAMES:
-            _write(axes, np.mean(points, axis=0), text, _RED if is_open else "0.25", (6, -11))
-    finish(figure, axes, picture, shapes)
-    _entitle(axes, largest, least)
+            names.append(Name(text, np.mean(points, axis=0), -1, {"color": _RED if is_open else "0.25"}))
+    title, style = _title(largest, least)
+    finish(figure, axes, picture, shapes, title, **style)
+    if not picture.planar:
+        names = [name._replace(place=flat(axes, name.place)) for name in names]
+    place_names(figure, axes, names)
     return figure
 
 
@@ -102,21 +106,11 @@ def _residuals(system, t, state):
     return out
 
 
-def _write(axes, place, text, color, offset, **style):
-    options = {"fontsize": "small", "color": color, "zorder": 7, **style}
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
-    if len(place) == 3:
-        axes.text(*place, text, bbox=box, **options)
-    else:
-        axes.annotate(text, place, xytext=offset, textcoords="offset points", bbox=box, ha="center", **options)
-
-
-def _entitle(axes, largest, least):
-    """Say whether all joints close, from their largest residuals."""
+def _title(largest, least) -> tuple[str, dict[str, Any]]:
+    """Words that say whether all joints close, from their largest residuals, and their style."""
     unmet = sorted((name for name, x in largest.items() if x > least), key=largest.__getitem__, reverse=True)
     if unmet:
         named = ", ".join(f"{name} by {largest[name]:.3g}" for name in unmet[:_TITLE])
         more = f" and {len(unmet) - _TITLE} more" if len(unmet) > _TITLE else ""
-        axes.set_title(f"open joints [m, rad]: {named}{more}", fontsize="medium", color=_RED)
-    elif largest:
-        axes.set_title("all joints are closed", fontsize="medium")
+        return f"open joints [m, rad]: {named}{more}", {"color": _RED}
+    return "all joints are closed" if largest else "", {}

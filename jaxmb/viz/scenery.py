@@ -14,8 +14,8 @@ from .motion_nodes import Motion
 
 # Vertical fields of view of planar and of spatial pictures; the narrow field shows nearly no perspective.
 _FRONT_ANGLE, _ANGLE = np.radians(8.0), np.radians(35.0)
-# Width over height of a picture.
-_ASPECT = 1.6
+# Width over height of a picture, and the share of it that the motions fill.
+_ASPECT, _FILLED = 1.6, 0.85
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,9 +86,14 @@ def _camera(planar, up, low, high):
         return stage.Camera(middle + away, middle, up, _FRONT_ANGLE, shadows=False)
     right, deep = _across(planar, up)
     direction = 0.55 * right - deep + 0.45 * up
-    half = 0.5 * np.linalg.norm(extent)
-    away = direction / np.linalg.norm(direction) * 0.9 * half / np.sin(_ANGLE / 2)
-    return stage.Camera(middle + away, middle, up, _ANGLE, shadows=True)
+    direction /= np.linalg.norm(direction)
+    across = np.cross(up, direction)
+    across /= np.linalg.norm(across)
+    corners = np.array(np.meshgrid(*zip(low - middle, high - middle, strict=True))).reshape(3, -1).T
+    # As near as the corners of the region allow, with some room for labels.
+    beside, above = np.abs(corners @ across) / _ASPECT, np.abs(corners @ np.cross(direction, across))
+    distance = np.max(corners @ direction + np.maximum(beside, above) / (_FILLED * np.tan(_ANGLE / 2)))
+    return stage.Camera(middle + distance * direction, middle, up, _ANGLE, shadows=True)
 
 
 def nodes(motions: Sequence[Motion], view: View) -> list[stage.SceneNode]:

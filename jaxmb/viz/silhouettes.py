@@ -22,10 +22,20 @@ _COIL = np.array([0.0, 0.15, *np.linspace(0.2, 0.8, 12), 0.85, 1.0])
 
 
 def area(shape: AbstractShape) -> Float[np.ndarray, "corners 3"]:
-    """The corners [m] of the convex hull of a shape in the plane, in the axes of its body."""
+    """The corners [m] of a shape's outline in the plane, by default of its convex hull, at the middle of its
+    depth; in the axes of its body.
+    """
+    outline = getattr(shape, "outline", None)
     vertices = getattr(shape, "vertices", None)
-    points = np.concatenate(_EDGES[shape.primitive]) if vertices is None else vertices
-    return hull(list(_placed(shape, points)))
+    points = _placed(shape, np.concatenate(_EDGES[shape.primitive]) if vertices is None else vertices)
+    corners = hull(list(points)) if outline is None else _placed(shape, outline)
+    return np.column_stack([corners[:, :2], np.full(len(corners), 0.5 * (points[:, 2].min() + points[:, 2].max()))])
+
+
+def size(corners: Float[np.ndarray, "corners 3"]) -> float:
+    """The area [m²] of a polygon in the plane."""
+    x, y = corners[:, :2].T
+    return 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
 
 
 def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:

@@ -86,10 +86,14 @@ def _linkage(points, planar, width):
         middle = np.mean(corners, axis=0)
         area = 0.5 * np.sum(_turn(corners, np.roll(corners, -1, axis=0), middle))
         if area > 2 * width * np.max(np.linalg.norm(corners - middle, axis=1)):
-            return [_plate(middle, corners, width), Sphere(1.4 * width)]
+            return [
+                Mesh.plate(corners[:, :2], 0.8 * width, position=(0.0, 0.0, -1.2 * width)),
+                Sphere(1.4 * width),
+            ]
     away = [point for point in points if np.linalg.norm(point) > 0.5 * width]
     bars = [Cylinder.between(np.zeros(3), point, width) for point in away]
-    return [*bars, Sphere(1.4 * width)] if bars else []
+    # A bar to a single point ends in the mass.
+    return [*bars, Sphere((1.4 if len(bars) > 1 else 2.2) * width)] if bars else []
 
 
 def hull(points):
@@ -111,16 +115,6 @@ def _turn(a, b, origin):
     """The third component of the product of two arms from an origin, positive for a turn to the left."""
     a, b = a - origin, b - origin
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _plate(middle, corners, width):
-    """A plate behind the bars, whose outline joins the corners."""
-    n, front, back = len(corners), np.array([0.0, 0.0, -0.8 * width]), np.array([0.0, 0.0, -1.6 * width])
-    rim = np.concatenate([corners + front, corners + back])
-    k, ahead = np.arange(n), np.roll(np.arange(n), -1)
-    face = np.stack([np.full(n, 2 * n), k, ahead], axis=1)
-    sides = np.concatenate([np.stack([k + n, ahead + n, ahead], 1), np.stack([k + n, ahead, k], 1)])
-    return Mesh(np.concatenate([rim, [middle + front]]), np.concatenate([face, sides]))
 
 
 def _support(point, up, width):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..parts.names import names_arguments, unknown
-from .figure import MOST, color, finish_panel, new_figure, with_unit
+from .figure import MOST, color, finish_panel, new_figure, shown_unit, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +47,7 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
             raise unknown("dimension", dimension, values.dims, "plot_sweep: at")
         values = values.sel({dimension: number}, method="nearest")
         bad = bad.sel({dimension: number}, method="nearest") if dimension in bad.dims else bad
-        held.append(f"{dimension} = {float(values[dimension]):.4g}")
+        held.append(f"{dimension} = {_value(values[dimension])}")
     if values.ndim not in (1, 2):
         raise ValueError(
             f"plot_sweep shows one or two dimensions, and {name!r} has {', '.join(map(str, values.dims)) or 'none'}; "
@@ -61,33 +61,42 @@ def plot_sweep(runs: Any, name: str, *, at: Mapping[str, float] | None = None) -
     return figure
 
 
-def _label(values) -> str:
-    return with_unit(str(values.name), values.attrs.get("units", ""))
+def _shown(values) -> tuple[np.ndarray, str]:
+    """Values in the unit that is shown, and their label with it."""
+    factor, unit = shown_unit(values.attrs.get("units", ""), values)
+    return factor * np.asarray(values), with_unit(str(values.name), unit)
+
+
+def _value(value) -> str:
+    """A value of a dimension with its unit."""
+    factor, unit = shown_unit(value.attrs.get("units", ""), value)
+    return f"{factor * float(value):.4g} {unit}".removesuffix(" 1").strip()
 
 
 def _curves(axes, values):
     """One curve, or one for each of a few values of the first dimension, along the last."""
     from matplotlib import colormaps
 
-    last = values[values.dims[-1]]
+    x, xlabel = _shown(values[values.dims[-1]])
+    table, label = _shown(values)
     if values.ndim == 1:
-        axes.plot(last, values, ".-", color=color(0), markersize=4)
+        axes.plot(x, table, ".-", color=color(0), markersize=4)
     else:
         first = values[values.dims[0]]
         shown = np.unique(np.linspace(0, first.size - 1, min(first.size, MOST)).round().astype(int))
         for n, k in enumerate(shown):
-            label = f"{first.name} = {float(first[k]):.4g} {first.attrs.get('units', '')}"
-            axes.plot(last, values[k], color=colormaps["viridis"](0.9 * n / shown.size), label=label)
-    axes.set_xlabel(_label(last))
-    finish_panel(axes, _label(values))
+            of_curve = colormaps["viridis"](0.9 * n / shown.size)
+            axes.plot(x, table[k], color=of_curve, label=f"{first.name} = {_value(first[k])}")
+    axes.set_xlabel(xlabel)
+    finish_panel(axes, label)
 
 
 def _map(axes, values):
     """Colours over two dimensions, the first to the right."""
-    right, up = (values[dimension] for dimension in values.dims)
-    table = np.asarray(values).T
+    (right, xlabel), (up, ylabel) = (_shown(values[dimension]) for dimension in values.dims)
+    table, label = _shown(values)
     finite = table[np.isfinite(table)]
     norm = "log" if finite.size and finite.max() > _WIDE * finite.min() > 0 else None
-    mesh = axes.pcolormesh(right, up, table, shading="nearest", cmap="viridis", norm=norm, rasterized=True)
-    axes.figure.colorbar(mesh, ax=axes, label=_label(values))
-    axes.set(xlabel=_label(right), ylabel=_label(up))
+    mesh = axes.pcolormesh(right, up, table.T, shading="nearest", cmap="viridis", norm=norm, rasterized=True)
+    axes.figure.colorbar(mesh, ax=axes, label=label)
+    axes.set(xlabel=xlabel, ylabel=ylabel)

@@ -380,8 +380,8 @@ FAULTS = [
     ),
     Fault(
         "parts/planar/joints.py",
-        "point = space.body_point(poses[0], space.point(poses[1], self.point_b))",
-        "point = space.point(poses[1], self.point_b)",
+        "return space.body_point(poses[0], space.point(poses[1], self.point_b))",
+        "return space.point(poses[1], self.point_b)",
     ),
     Fault(
         "parts/planar/joints.py",
@@ -1178,6 +1178,11 @@ FAULTS = [
     ),
     Fault("viz/meshes.py", "angle = 2 * np.pi * _COIL_TURNS * wound", "angle = np.pi * _COIL_TURNS * wound"),
     Fault("viz/motion.py", "if np.ptp(line.values) <= _STILL * size", "if np.ptp(line.values) >= _STILL * size"),
+    Fault("parts/planar/joints.py", "distance / (1 - self.ratio)", "distance / (1 + self.ratio)"),
+    Fault("parts/planar/level_curves.py", "point + step * along", "point - 2 * step * along"),
+    Fault("bodies/picture.py", "+ np.maximum(slack, 0.0)", "+ 2 * np.maximum(slack, 0.0)"),
+    Fault("viz/placed_names.py", "for distance in _DISTANCES", "for distance in _DISTANCES[:1]"),
+    Fault("viz/scenery.py", "np.maximum(beside, above)", "np.minimum(beside, above)"),
     Fault(
         "viz/silhouettes.py",
         "(points * shape.scale) @ rotation_matrix(shape.orientation).T",

@@ -10,6 +10,7 @@ import pytest
 import scipy.integrate
 import scipy.optimize
 from at_instants import instants, point
+from trajectories import motion_of
 
 import jaxmb as mb
 from jaxmb import planar, spatial
@@ -227,6 +228,10 @@ def test_rope_of_atwoods_machine(grips, again):
     tensions = np.array([G + acceleration, 2.0 * (G - acceleration)])
     found = sum(own(f"{name}.tension")[0] for name in ("rope", *again))
     np.testing.assert_allclose(found, tensions if grips else tensions[0], rtol=1e-12)
+    if grips:
+        q, u = (np.stack([y, y]) for y in (system.guess.q, system.guess.u))
+        (axes,) = motion_of(system, np.array([0.0, 1.0]), q, u).plot("rope.tension").axes
+        assert [line.get_label() for line in axes.lines] == ["rope span 1", "rope span 2"]
     implied = [(item.name, item.by) for item in system.implied]
     assert implied in ([("again", ("rope",))], [("rope", ("again",))]) if again else not implied
 

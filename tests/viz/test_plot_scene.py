@@ -119,3 +119,39 @@ def test_plot_scene_has_room_beside_a_thin_machine(flat):
     (axes,) = viz.plot_scene(mb.Scene(bodies, joints=joints)).axes
     long, thin = sorted((np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())))[::-1]
     assert thin == pytest.approx(long / 5)
+
+
+def overlaps(boxes):
+    pairs = ((a, b) for k, a in enumerate(boxes) for b in boxes[:k])
+    return [max(0.0, min(a.x1, b.x1) - max(a.x0, b.x0)) * max(0.0, min(a.y1, b.y1) - max(a.y0, b.y0)) for a, b in pairs]
+
+
+def crowded(own, way, **axis):
+    """Five bodies on one axle, and another one away."""
+    at, inertia = 0.0 * np.array(way), 0.1 if own is planar else np.eye(3)
+    bodies = [own.Body(f"wheel {k}", mass=1.0, inertia=inertia, position=at) for k in range(5)]
+    bodies.append(own.Body("arm", mass=1.0, inertia=inertia, position=way))
+    joints = [own.Revolute(f"axle {x.name}", "ground", x.name, point=at, **axis) for x in bodies]
+    figure = viz.plot_scene(mb.Scene(bodies, joints=joints))
+    figure.draw_without_rendering()
+    return figure, figure.axes[0]
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_names_neither_overlap_nor_leave_the_figure(way):
+    figure, axes = crowded(planar, way) if len(way) == 2 else crowded(spatial, way, axis=(0.0, 0.0, 1.0))
+    boxes = [super(type(text), text).get_window_extent() for text in axes.texts]
+    assert len(boxes) == 12 and max(overlaps(boxes)) == 0.0
+    for box in boxes:
+        assert box.x0 >= 0 and box.y0 >= 0 and (box.max <= figure.bbox.max).all()
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_a_machine_in_space_fills_its_figure(way):
+    figure, axes = crowded(spatial, way, axis=(0.0, 0.0, 1.0))
+    shown = [*(axis.get_tightbbox() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)), axes.title.get_window_extent()]
+    low, high = np.min([box.min for box in shown], axis=0), np.max([box.max for box in shown], axis=0)
+    size = figure.bbox.max
+    assert (low >= 0).all() and (high <= size).all()
+    assert (high - low)[1] > 0.9 * size[1] and ((high - low)[0] > 0.9 * size[0] or size[1] > 600)
+    assert shown[-1].y0 > max(box.y1 for box in shown[:-1])

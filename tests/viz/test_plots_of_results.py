@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import types
 
 import jax
 import numpy as np
@@ -16,6 +17,7 @@ from jaxmb.studies.identify import Identification
 from jaxmb.studies.optimise.optimise import ConstrainedOutput
 from jaxmb.studies.optimise.trials import Iteration
 from jaxmb.viz.figure import color, colors_of, draw_legend, new_figure, shown_unit
+from jaxmb.viz.plan import plot as plot_of_plan
 
 TS = np.linspace(0.0, 1.0, 6)
 
@@ -213,6 +215,18 @@ def test_required_forces(double):
         *("t", "p1.angle", "p2.angle", "b1.position[0]", "b1.position[1]"),
         *("p1.angle power", "p2.angle power", "b1.position power"),
     ]
+
+
+def test_plan_shows_held_controls_as_steps_and_quantities_in_the_colours_of_their_bodies(double):
+    controls = {kind: mb.Series([0.0, 0.5, 1.0], [1.0, -1.0, -1.0], kind) for kind in ("held", "linear")}
+    along = dict.fromkeys(controls, 1.0 - TS)
+    plan = types.SimpleNamespace(
+        trajectory=double, system=double.system, controls=controls, along=along, bounds={"held": (-1.0, 1.0)}
+    )
+    held, linear, angle = plot_of_plan(plan, ["b2.angle"]).axes
+    assert [axes.lines[0].get_drawstyle() for axes in (held, linear)] == ["steps-post", "default"]
+    np.testing.assert_array_equal([line.get_ydata()[0] for line in held.lines[1:]], [-1.0, 1.0])
+    assert angle.get_ylabel() == "angle [rad]" and angle.lines[0].get_color() == color(1)
 
 
 def loads_of(points, forces, moments):
@@ -467,6 +481,7 @@ def test_sweeps_are_curves_and_maps():
         },
         {"mass": ("mass", [1.0, 2.0, 3.0], {"units": "kg"}), "length": [0.1, 0.2, 0.3, 0.4], "time": np.arange(5.0)},
     )
+    short = runs.assign_coords(length=("length", [0.01, 0.02, 0.03, 0.04], {"units": "m"}))
     figure = viz.plot_sweep(runs, "swing")
     colours, bar = figure.axes
     assert (colours.get_xlabel(), colours.get_ylabel(), bar.get_ylabel()) == ("mass [kg]", "length", "swing [rad]")
@@ -479,7 +494,14 @@ def test_sweeps_are_curves_and_maps():
     (over_time,) = viz.plot_sweep(runs, "angle", at={"length": 0.19}).axes
     assert labels(over_time) == ["mass = 1 kg", "mass = 2 kg", "mass = 3 kg"]
     np.testing.assert_array_equal(over_time.lines[1].get_ydata(), 25.0 + np.arange(5.0))
-    (line,) = viz.plot_sweep(runs, "swing", at={"mass": 3.0}).axes[0].lines
+    assert viz.plot_sweep(short, "swing").axes[0].get_ylabel() == "length [mm]"
+    figure = viz.plot_sweep(short, "swing", at={"mass": 3.0})
+    (line,) = figure.axes[0].lines
+    assert (figure.get_suptitle(), figure.axes[0].get_xlabel()) == (
+        "mass = 3 kg; 1 of 4 members failed and are left out",
+        "length [mm]",
+    )
+    np.testing.assert_allclose(line.get_xdata(), [10.0, 20.0, 30.0, 40.0])
     np.testing.assert_array_equal(line.get_ydata(), [8.0, 9.0, 10.0, np.nan])
     for name, at, message in (
         ("swin", None, "did you mean 'swing'"),

@@ -3,6 +3,7 @@
 In their classes `A` and `B` are the world positions of the two points, `d = B − A`, and `n` is the normal of the axis.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -24,8 +25,9 @@ from ..base import (
     Quantities,
 )
 from ..elements import coincident, in_planes, perpendicular
-from ..shapes import pin, sleeve, wheel
+from ..shapes import Box, Cylinder, Mesh, pin, sleeve, wheel
 from ..space import nearest_to_origin, separation
+from .level_curves import level_curve
 
 
 def relative_angle(poses: Float[Array, "k p"]) -> Float[Array, ""]:
@@ -224,11 +226,24 @@ class PointOnCurve(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     rheonomic: ClassVar[bool] = False
 
     def residual(self, space, poses, t):
-        point = space.body_point(poses[0], space.point(poses[1], self.point_b))
-        return jnp.reshape(self.curve(point, self.parameters), (1,))
+        return jnp.reshape(self.curve(self.followed(space, poses), self.parameters), (1,))
 
     def coordinates(self, space, poses):
         return {"angle": relative_angle(poses)}
+
+    def followed(self, space, poses):
+        """B on the curve, in the frame of `body_a`."""
+        return space.body_point(poses[0], space.point(poses[1], self.point_b))
+
+    def shapes(self, space, size):
+        return ((1, pin(space.in_space(self.point_b), size)),)
+
+    def shapes_along(self, space, size, followed):
+        line, closed = level_curve(self.curve, self.parameters, followed, size)
+        if closed:
+            return ((0, Mesh.plate(line, size)),)
+        points = np.column_stack([line, np.zeros(len(line))])
+        return tuple((0, Cylinder.between(*ends, 0.5 * size)) for ends in itertools.pairwise(points))
 
 
 class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
@@ -262,6 +277,12 @@ class Gear(AbstractPlanarPart, AbstractPair, AbstractConstraint):
 
     def complete(self, space, poses):
         return self.filled(offset=poses[1, 2] - poses[2, 2] - self.ratio * (poses[0, 2] - poses[2, 2]))
+
+    def pitch_radii(self, distance):
+        if self.ratio == 1:
+            return None
+        radius_b = -np.sign(self.ratio) * distance / (1 - self.ratio)
+        return -self.ratio * radius_b, radius_b
 
     def residual(self, space, poses, t):
         a, b, c = poses[0, 2], poses[1, 2], poses[2, 2]
@@ -314,3 +335,20 @@ class RackAndPinion(AbstractPlanarPart, AbstractPair, AbstractConstraint):
     def shapes(self, space, size):
         pinion = wheel(self.radius, 2 * size, space.in_space(self.point_a))
         return tuple((0, shape) for shape in pinion)
+
+    def followed(self, space, poses):
+        """The centre of the pinion on the rack."""
+        return space.body_point(poses[1], space.point(poses[0], self.point_a))
+
+    def shapes_along(self, space, size, followed):
+        x, y = self.axis_b
+        along, below = followed @ self.axis_b, followed[0] @ np.array([-y, x]) - self.radius - size
+        start, end = along.min() - 2 * self.radius, along.max() + 2 * self.radius
+        middle = 0.5 * (start + end) * self.axis_b + below * np.array([-y, x])
+        turn = np.arctan2(y, x) / 2
+        rack = Box(
+            (end - start, 2 * size, 2 * size),
+            position=(*middle, 0.0),
+            orientation=(np.cos(turn), 0.0, 0.0, np.sin(turn)),
+        )
+        return ((1, rack),)

@@ -18,7 +18,7 @@ from .. import fields
 from ..base import AbstractAxisJoint, AbstractJoint, AbstractSpatialPart, PathKind, Quantities
 from ..coordinate_parts import turns
 from ..elements import coincident, in_planes, perpendicular
-from ..shapes import ball, pin, sleeve
+from ..shapes import Cylinder, ball, pin, sleeve
 from ..space import nearest_to_origin, separation
 from .axes import (
     across,
@@ -396,6 +396,18 @@ class Screw(AbstractSliding):
 
     def coordinate_rates(self, space, poses, velocities):
         return self._rates(space, poses, velocities)
+
+    def followed(self, space, poses):
+        return displacement_along(space, self, poses)
+
+    def shapes(self, space, size):
+        return ((0, sleeve(self.point_a, size, self.axis_a)),)
+
+    def shapes_along(self, space, size, followed):
+        # The rod is in B, and passes the nut at all times.
+        start = self.point_b + (min(0.0, *-followed) - 4 * size) * self.axis_b
+        end = self.point_b + (max(0.0, *-followed) + 4 * size) * self.axis_b
+        return ((1, Cylinder.between(start, end, size)),)
 
     def residual(self, space, poses, t):
         shift = offset_in_a(space, self, poses)

@@ -84,7 +84,7 @@ class Model(NamedTuple):
 
     **Fields:** `linearised`, with residuals weighted by the loss, and `plain`, unweighted; `data`: the number of
     residuals of data, which come first, before priors and noise levels; `results` of the simulations; `readings`:
-    predictions by experiment and sensor.
+    predictions by experiment and sensor; `continuity`: the largest gap between segments.
     """
 
     linearised: Linearised
@@ -92,6 +92,7 @@ class Model(NamedTuple):
     data: int
     results: tuple[RESULTS, ...]
     readings: dict[str, dict[str, np.ndarray]]
+    continuity: float = 0.0
 
 
 def linearise(problem: Problem, z: Float[Array, "n"]) -> Model:

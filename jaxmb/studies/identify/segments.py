@@ -132,7 +132,8 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     _, derivatives, prior_rows, prior_jacobian = values_and_derivatives(problem, place.z)
     n, total = place.z.size, place.size
     residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
-    readings, objective = {}, 0.5 * prior_rows @ prior_rows
+    readings, objective, continuity = {}, 0.5 * prior_rows @ prior_rows, 0.0
+    typical = np.concatenate([problem.system.coordinate_scale(), problem.system.velocity_scale()])
     columns = place.split(np.arange(total))
     for lane, charts, lane_columns in zip(lanes, place.charts, columns, strict=True):
         trial, flat = problem.trials[lane.number], _values_of(problem, lane, place.z)
@@ -160,6 +161,8 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
         first = np.pad(of_initial @ inward, ((0, 0), (0, total - n)))
         arrival, change = np.stack([initial, *ends[0][:-1]]), np.stack([first, *end[:-1]])
         places, scales = charts.indices, charts.scales
+        # Charts do not tell the branches of the constraints apart.
+        continuity = max(continuity, float(np.max(np.abs(arrival - starts[0]) / typical)))
         gaps.append((np.take_along_axis(arrival - starts[0], places, 1) / scales).reshape(-1))
         of_gaps = np.take_along_axis(change - start, places[..., None], 1)
         closing.append((of_gaps / scales[..., None]).reshape(-1, total))
@@ -173,7 +176,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     plain = Linearised(whole_rows, np.vstack([*jacobian, prior_whole, *score_rows]), objective)
     data = sum(part.size for part in residuals)
     linearised = weighted(problem, plain, data)._replace(gaps=np.concatenate(gaps), closing=np.vstack(closing))
-    return Model(linearised, plain, data, (), readings)
+    return Model(linearised, plain, data, (), readings, continuity)
 
 
 @eqx.filter_jit

@@ -76,7 +76,7 @@ def shoot(problem: Problem, z: Float[Array, "n"], segments: int, tol: float, lim
         along=basis[: z.size],
         objective=end.value,
         readings=model.readings,
-        continuity=float(np.max(np.abs(model.linearised.gaps))),
+        continuity=model.continuity,
         iterations=end.iterations,
         success=end.success,
     )

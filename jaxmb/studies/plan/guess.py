@@ -211,11 +211,16 @@ def _first(system: AbstractSystem, given: State | Limits, t: Scalar, near: State
 def _given(
     system: AbstractSystem, limits: Limits, known: Iterable[str], state: State, t: Scalar
 ) -> dict[str, np.ndarray]:
-    """The values of quantities with known names; within bounds, those next to the values of a state."""
+    """The values of quantities with known names; of bounds, those that a state violates, by the bound."""
     out, known = {}, set(known)
     for name, (low, high) in limits.by_name().items():
-        if name in known:
-            out[name] = low if np.all(low == high) else np.clip(evaluate(system, state, name, t=t), low, high)
+        if name not in known:
+            continue
+        value = low if np.all(low == high) else evaluate(system, state, name, t=t)
+        nearest = np.clip(value, low, high)
+        # Within its bounds a coordinate follows from others, on which it may depend.
+        if np.all(low == high) or np.any(nearest != value):
+            out[name] = nearest
     return out
 
 

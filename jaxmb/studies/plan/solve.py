@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..._types import State
+from ...system import AbstractSystem
 from .guess import Guess
 from .lanes import MOST_STEPS
 from .problem import Evaluated
 from .solvers import Answer, chosen_method, minimise
 from .task import Task
-from .transcription import Program, Transcription
+from .transcription import Program, Transcription, full_turns
 
 # The most rounds; charts beyond this quality are replaced.
 _ROUNDS, _WORN = 40, 3.0
@@ -25,6 +26,9 @@ _FIRST_ERROR = 1e-3
 _FURTHER = 4
 # The effect of a control, relative to the largest of any, that is none.
 _NO_EFFECT = 1e-13
+# The distance of coordinates, relative to typical ones, of states on different branches of the constraints.
+_APART = 1e-3
+_JUMP = "; take more intervals, or a guess= nearer to a motion"
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
 _SMALL_JUMP, _SWITCH = 0.02, 0.4
 
@@ -94,11 +98,13 @@ def solved(
         worn, before = program.quality(), steps
         each = zip(program.parts, program.variables(answer.z), program.intervals(), strict=True)
         found = [_reached(part.read(z), at) for part, z, at in each]
+        apart, moved = _rejoined(program, found) if answer.success else ("", False)
         steps, errors = _enough_steps(program, answer.z, steps, tol, [_FURTHER * count for count in steps])
         lost = not all(np.all(np.isfinite(x)) for guess in found for x in (guess.states.q, guess.states.u))
         guesses = guesses if lost else found
         is_last = answer.interrupted or len(log) >= limit or lost or not rounds_left
-        if is_last or (steps == before and worn <= _WORN):
+        if is_last or (steps == before and worn <= _WORN and not moved):
+            answer = answer._replace(success=False, message=apart + _JUMP) if apart else answer
             return _each_phase(program, answer, guesses, tuple(log), errors)
     raise AssertionError("unreachable")
 
@@ -107,14 +113,54 @@ def _reached(found: Guess, at: Evaluated) -> Guess:
     """The states at nodes; the last, which may have left its chart since no interval begins there, is then the arrival
     of the last interval.
     """
-    states, arrived = found.states, at.outputs[0][-1]
+    states = found.states
     if np.all(np.isfinite(states.q[-1])) and np.all(np.isfinite(states.u[-1])):
         return found
-    nq, nu = states.q.shape[1], states.u.shape[1]
-    q, u, z, _ = np.split(arrived, [nq, nq + nu, arrived.size - 2])
-    pairs = (states.q, q), (states.u, u), *(() if states.z is None else ((states.z, z),))
-    replaced: list[Any] = [np.concatenate([ys[:-1], y[None]]) for ys, y in pairs]
-    return found._replace(states=State(*replaced))
+    return found._replace(states=_replaced(states, -1, _arrivals(states, at)[-1]))
+
+
+def _arrivals(states: State, at: Evaluated) -> np.ndarray:
+    """Coordinates, velocities and further states at the ends of intervals, side by side."""
+    return at.outputs[0][:, : states.q.shape[1] + states.u.shape[1] + (0 if states.z is None else states.z.shape[1])]
+
+
+def _replaced(states: State, node: int, values: np.ndarray) -> State:
+    each: list[Any] = [np.array(x) for x in (states.q, states.u, states.z) if x is not None]
+    for own, new in zip(each, np.split(values, np.cumsum([x.shape[1] for x in each])[:-1]), strict=True):
+        own[node] = new
+    return State(*each, angles=states.angles)
+
+
+def _rejoined(program: Program, found: list[Guess]) -> tuple[str, bool]:
+    """Where intervals meet in the coordinates of a chart and yet on different branches of the constraints, the node
+    moves to the arrival of the interval before it, in `found`, unless its state is given.
+
+    **Returns:** the first such place in words, and whether nodes moved.
+    """
+    places, moved = [], False
+    for phase, (part, at) in enumerate(zip(program.parts, program.intervals(), strict=True)):
+        task, (states, ts, *_) = part.task, found[phase]
+        arrivals = _arrivals(states, at)
+        for k in range(1, task.intervals + 1):
+            if _apart(task.system, arrivals[k - 1, : task.system.nq], states.q[k]):
+                places.append(ts[k])
+                if k < task.intervals or not isinstance(task.end, State):
+                    states, moved = _replaced(states, k, arrivals[k - 1]), True
+        found[phase] = found[phase]._replace(states=states)
+        if task.periodic and _apart(task.system, states.q[-1] - full_turns(task.system, states), states.q[0]):
+            places.append(ts[-1])
+    where = (
+        f"at t = {min(places, default=0.0):.4g} s the motion would jump from one branch of the constraints to another"
+    )
+    return where if places else "", moved
+
+
+def _apart(system: AbstractSystem, a: Any, b: Any) -> bool:
+    a = np.array(a)
+    for name, where in system.coordinate_names().items():
+        if name.endswith(".orientation") and np.dot(a[where], b[where]) < 0:
+            a[where] *= -1.0
+    return bool(np.max(np.abs(a - b) / system.coordinate_scale(), initial=0.0) > _APART)
 
 
 def _each_phase(program, answer, guesses, log, errors):

@@ -481,16 +481,23 @@ class _Transcriber:
 
     def _close(self) -> None:
         """The end is the start, up to turns of angles and the signs of Euler parameters, which the guess tells."""
-        system, places, nodes, ys = self.task.system, self.places, self.nodes, self.guess.states
-        indices, scales = nodes.charts[1][0], nodes.scales[0]
-        signs, turns = np.ones(system.nq + system.nu + system.nz), np.zeros(system.nq + system.nu + system.nz)
+        system, places, indices, scales = self.task.system, self.places, self.nodes.charts[1][0], self.nodes.scales[0]
+        q, further = self.guess.states.q, np.zeros(system.nu + system.nz)
+        signs = np.ones(system.nq)
         for name, where in system.coordinate_names().items():
-            if name.endswith(".orientation"):
-                signs[where] = -1.0 if np.dot(ys.q[0, where], ys.q[-1, where]) < 0 else 1.0
-            elif name.endswith(".angle") or not system.body_names:
-                turns[where] = 2 * np.pi * np.round((ys.q[-1, where] - ys.q[0, where]) / (2 * np.pi))
-        shift = turns[indices] / scales
+            if name.endswith(".orientation") and np.dot(q[0, where], q[-1, where]) < 0:
+                signs[where] = -1.0
+        shift = np.append(full_turns(system, self.guess.states), further)[indices] / scales
         rows = self._rows("period", ["period"] * scales.size, shift, shift)
         last = (self.task.intervals - 1) * self.terms[0].outputs
-        self.of_outputs.add(rows, last + indices, signs[indices] / scales)
+        self.of_outputs.add(rows, last + indices, np.append(signs, further + 1.0)[indices] / scales)
         self.of_variables.add(rows, places.x[0], -1.0 / scales)
+
+
+def full_turns(system: AbstractSystem, states: State) -> np.ndarray:
+    """The full turns of angles from the first state to the last [rad], in the places of the coordinates."""
+    q, turns = np.asarray(states.q), np.zeros(system.nq)
+    for name, where in system.coordinate_names().items():
+        if name.endswith(".angle") or not (name.endswith(".orientation") or system.body_names):
+            turns[where] = 2 * np.pi * np.round((q[-1, where] - q[0, where]) / (2 * np.pi))
+    return turns

@@ -325,6 +325,8 @@ def test_multiple_shooting_where_single_shooting_fails():
     free = {"rod.inertia": 0.5, "damper.damping": 0.05}
     fit = mb.identify(own, data, free=free, segments=16, **common)
     assert fit.converged and fit.continuity < 1e-8
+    jumps = dataclasses.replace(fit, continuity=0.5)
+    assert not jumps.converged and "another branch" in jumps.message
     assert 0.8 < fit.rms < 1.2
     for name, true in {"rod.inertia": 0.25, "damper.damping": 0.01, "initial.rod.angle": np.pi / 2 + 0.01}.items():
         assert abs(fit.parameters[name] - true) < 4 * fit.deviations[name], name

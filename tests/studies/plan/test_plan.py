@@ -132,6 +132,21 @@ def test_derivatives_of_an_optimum_are_differences_of_optima(system, planned):
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
+def test_plan_to_another_branch_of_the_constraints_does_not_succeed(system):
+    """The crank does not tell the open linkage from the crossed one, and no motion leads from one to the other."""
+    here = mb.assemble(system, fix={"crank.angle": 1.57})
+    crank, rocker = np.array([np.cos(1.57), np.sin(1.57)]), np.array([2.5, 0.0])
+    pin = rocker + 1.8 * np.array([np.cos(here.q[8]), np.sin(here.q[8])])
+    along = (rocker - crank) / np.linalg.norm(rocker - crank)
+    mirrored = crank + 2 * along * np.dot(pin - crank, along) - (pin - crank)
+    angles = [np.arctan2(*(mirrored - pivot)[::-1]) for pivot in (crank, rocker)]
+    places = [*here.q[:3], *(crank + mirrored) / 2, angles[0], *(rocker + mirrored) / 2, angles[1]]
+    crossed = mb.assemble(system, mb.State(jnp.array(places), here.u), fix={"crank.angle": 1.57})
+    np.testing.assert_allclose(crossed.q, places, rtol=0, atol=1e-12)
+    plan = mb.plan(system, controls=FREE, duration=2.0, running="effort", start=here, end=crossed, intervals=8)
+    assert not plan.success and "at t = 2 s the motion would jump" in plan.message
+
+
 @pytest.mark.slow
 def test_prices_of_ends_and_of_the_duration_are_differences_of_optima(system, planned):
     plan, aside = planned("effort", 8), 1e-3

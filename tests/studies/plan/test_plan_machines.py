@@ -295,6 +295,40 @@ def test_plan_of_least_time_of_a_knife_edge_under_gravity_is_a_cycloid():
     np.testing.assert_allclose(plan.objective, CYCLOID, rtol=1e-9)
 
 
+def test_plan_of_the_shape_of_a_slide_in_least_time_is_a_cycloid():
+    """The slide is a distance from a place above its end as a function of the angle there. A series in the root of the
+    angle can begin as a cycloid does, in a cusp; the bead is released 16 μm below it.
+    """
+    pole, below, above, share = np.array([10.0, 10.0]), 5.0, 10.0, 1e-6
+
+    def slide(point, numbers):
+        turned = jnp.arctan2(-point[1], -point[0]) / (np.pi / 2)
+        bulge = turned * (1 - turned) * jnp.polyval(numbers["shape"], jnp.sqrt(turned))
+        return jnp.linalg.norm(point) - above + (above - below) * turned - bulge
+
+    begin = (above - (above - below) * share) * np.array([np.cos(share * np.pi / 2), np.sin(share * np.pi / 2)])
+    bead = planar.Body("bead", mass=1.0, inertia=1.0, position=pole - begin)
+    rail = planar.PointOnCurve("rail", "pole", "bead", slide, parameters={"shape": np.zeros(6)})
+    forces, frames = [mb.Gravity((0.0, -9.80665))], [planar.Frame("pole", "ground", position=pole)]
+    system = mb.Scene([bead], joints=[rail], forces=forces, frames=frames).compile()
+    rest = {"bead.y": bead.position[1], "bead.y_rate": 0.0, "bead.angle": 0.0, "bead.angle_rate": 0.0}
+    plan = mb.plan(
+        system,
+        controls={},
+        design={"rail.shape": (-20.0 * np.ones(6), 20.0 * np.ones(6))},
+        duration=(1.0, 3.0),
+        start={**rest, "bead.x": (-1.0, 1.0)},
+        end={"bead.x": pole[0]},
+        final="time",
+        intervals=16,
+        guess=mb.simulate(system, mb.assemble(system), t1=1.9, saveat=np.linspace(0.0, 1.9, 101)),
+    )
+    check_motion(plan)
+    np.testing.assert_allclose(plan.objective, CYCLOID, rtol=1e-6)
+    # The bottom of the cycloid is twice the radius of its circle below the start.
+    np.testing.assert_allclose(np.min(plan.trajectory["bead"].position[:, 1]), 4.828000783, rtol=0, atol=2e-3)
+
+
 def test_plan_of_a_crane_in_least_time_leaves_no_swing():
     """A heavy trolley is at rest as soon as without its load if it accelerates for a period of small swings, and then
     brakes as long: T = 4 π / ω.
