@@ -6,7 +6,10 @@ of them, and says what is missing when an update removes it.
 
 import functools
 import importlib.util
+import io
 import mmap
+import operator
+import pickle
 import pkgutil
 import weakref
 from collections.abc import Callable, Iterator, Mapping
@@ -25,8 +28,12 @@ import numpy as np
 from jax._src import compilation_cache, pjit, xla_bridge
 from jax._src.array import ArrayImpl
 from jax._src.compilation_cache_interface import CacheInterface
+from jax._src.core import JaxprEqnContext
+from jax._src.interpreters import mlir as lowerings
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
+from jax._src.named_sharding import UNSPECIFIED
 from jax.core import ShapedArray
+from jax.experimental import serialize_executable
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core, source_info_util
 from jax.extend.core import Primitive
@@ -52,8 +59,17 @@ ClosedJaxpr, Jaxpr, Literal = core.ClosedJaxpr, core.Jaxpr, core.Literal
 # reverse mode. (custom_jvp_call and custom_vjp_call, 0.9 and 0.10.)
 REVERSE = "bwd"
 RULES = frozenset({"jvp_jaxpr_fun", "fwd_jaxpr_thunk", REVERSE, "out_trees"})
+# The parameter of equations of functions with rules for batches. (custom_vmap_call, 0.9 to 0.12.)
+BATCH_RULE = "rule"
 # A closed jaxpr as a function of its operands. (jax.extend.core.jaxpr_as_fun, 0.9 and 0.10.)
 jaxpr_as_function = core.jaxpr_as_fun
+
+
+# The settings of JAX that an equation was traced with, such as metadata for XLA.
+# (jax._src.core.JaxprEqnContext, 0.9 to 0.12.)
+settings_of: Callable[[Any], tuple[Any, ...]] = operator.attrgetter(
+    *(f"ctx.{name}" for name in JaxprEqnContext.__slots__ if name not in ("configs", "__weakref__"))
+)
 
 
 def bound(equation: Any, operands: Any) -> Any:
@@ -199,6 +215,96 @@ def evaluate_calls_by(rule: Callable[[Callable[[], Any], str, Any, list[Any]], A
         return rule(lambda: plain(*arrays, **params), params["name"], params["jaxpr"], list(arrays))
 
     call.def_impl(evaluated)
+
+
+def compile_calls_by(rule: Callable[[tuple[Any, ...], dict[str, Any], Callable[[], Any]], Any]) -> None:
+    """Let `rule(arrays, parameters, compile)` give the executables of compiled functions that JAX calls for the first
+    time; `compile()` is what JAX does.
+
+    (jax._src.pjit._pjit_call_impl_python, and MeshExecutable.unsafe_call, 0.9 to 0.12.)
+    """
+    plain = pjit._pjit_call_impl_python
+
+    @functools.wraps(plain)
+    def called(*arrays, **params):
+        results: list[Any] = []
+
+        def compile() -> Any:
+            results[:] = plain(*arrays, **params)
+            return results[1]
+
+        executable = rule(arrays, params, compile)
+        return tuple(results) or (executable.unsafe_call(*arrays), executable, None, [])
+
+    pjit._pjit_call_impl_python = called
+
+
+def goes_anywhere(arrays: Any, params: Mapping[str, Any]) -> bool:
+    """Whether a call of a compiled function names no device or layout, and has no effect besides its results.
+
+    (The parameters of jax._src.pjit.jit_p, and Array._committed, 0.9 to 0.12.)
+    """
+    places, layouts = ([*params[f"in_{what}"], *params[f"out_{what}"]] for what in ("shardings", "layouts"))
+    return (
+        all(x is UNSPECIFIED for x in places)
+        and all(x is None for x in layouts)
+        and params["ctx_mesh"].empty
+        and not params["jaxpr"].effects
+        and not any(getattr(x, "_committed", False) for x in arrays)
+    )
+
+
+def is_pure(executable: Any) -> bool:
+    """Whether a compiled program holds nothing of its process, as callbacks do.
+
+    (MeshExecutable._unloaded_executable, 0.9 to 0.12.)
+    """
+    parts = executable._unloaded_executable
+    effects = parts.unordered_effects, parts.ordered_effects
+    return not any((parts.host_callbacks, parts.keepalive, parts.mut, parts.pgle_profiler, *effects))
+
+
+def pickled_executable(executable: Any, program: str) -> bytes:
+    """What JAX knows of an executable, and the key of its program in JAX's folder.
+
+    (MeshExecutable._unloaded_executable, and the pickler of jax.experimental.serialize_executable, 0.9 to 0.12.)
+    """
+
+    class Pickler(serialize_executable._JaxPjrtPickler):
+        def persistent_id(self, obj) -> Any:
+            return ("program", program) if obj is executable.xla_executable else super().persistent_id(obj)
+
+    file = io.BytesIO()
+    Pickler(file).dump(executable._unloaded_executable)
+    return file.getvalue()
+
+
+def unpickled_executable(text: bytes) -> Any:
+    """The executable of a text, with its program from JAX's folder. It raises any error if it cannot be read.
+
+    (jax._src.compilation_cache.get_executable_and_time, UnloadedMeshExecutable.load, 0.9 to 0.12.)
+    """
+
+    class Unpickler(serialize_executable._JaxPjrtUnpickler):
+        def persistent_load(self, pid) -> Any:
+            if pid[0] != "program":
+                return super().persistent_load(pid)
+            found, _ = compilation_cache.get_executable_and_time(pid[1], None, self.backend, self.execution_devices)
+            if found is None:
+                raise pickle.UnpicklingError("the program was dropped")
+            return found
+
+    return Unpickler(io.BytesIO(text), jax.devices()[0].client).load().load()
+
+
+def lowering_of(operation: Primitive, platform: str) -> Callable[..., Any] | None:
+    """The function that lowers an operation on a platform, None without one.
+
+    (jax._src.interpreters.mlir._platform_specific_lowerings and _lowerings, 0.9 to 0.12.)
+    """
+    of_platform: Any = lowerings._platform_specific_lowerings[platform]
+    entry = of_platform.get(operation) or lowerings._lowerings.get(operation)
+    return None if entry is None else entry.rule
 
 
 def keep_programs_as(store: type[CacheInterface]) -> None:

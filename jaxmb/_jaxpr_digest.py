@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import hashlib
+import marshal
+import sys
 import types
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -12,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._compat import REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of
+from ._compat import BATCH_RULE, REVERSE, RULES, ClosedJaxpr, Jaxpr, Literal, jaxpr_as_function, like_of, settings_of
 from ._traced_functions import is_installed, is_of_jax
 
 _PLAIN = {bool, int, float, complex, str, bytes, type(None), type(Ellipsis)}
@@ -22,11 +24,15 @@ class Digest(NamedTuple):
     """The hash of a program.
 
     **Fields:** `value`: the same in every process; `unknown`: functions of the user that the program calls from Python,
-    and objects that only their address distinguishes. The hash contains their names.
+    and objects of the user's classes, or that only their address distinguishes. The hash contains their names.
+    `operations` of the program; whether an operation `calls` functions of packages, besides rules of derivatives and
+    batches: the hash contains their names.
     """
 
     value: bytes
     unknown: tuple[Any, ...]
+    operations: frozenset[Any]
+    calls: bool
 
 
 def digest_of(value: Any, *, rules: bool) -> Digest:
@@ -37,93 +43,106 @@ def digest_of(value: Any, *, rules: bool) -> Digest:
     is not differentiated does not use them.
     """
     digest = _Digest()
-    text = digest.of(value)
+    text = _hashed(digest.of(value))
     if rules and digest.rules:
-        text = _joined("rules", [text, digest.of_derivative(value)])
-    return Digest(text, tuple(digest.unknown))
+        text = _hashed(["rules", text, digest.of_derivative(value)])
+    return Digest(text, tuple(digest.unknown), frozenset(digest.operations), digest.calls)
 
 
 class _Digest:
-    """Hashes of programs; `rules`: the names of the derivative rules of their equations."""
+    """Texts of programs and their parameters, of which a hash is made: plain values, tuples of texts, and lists that
+    begin with the name of a type.
+
+    **Fields:** `rules`: the names of the derivative rules of the equations; `unknown`, `operations` and `calls` of the
+    `Digest`.
+    """
 
     def __init__(self):
         self.unknown: list[Any] = []
         self.rules: set[str] = set()
-        # Programs that occur several times. Each hash keeps its program, so that no other program gets its address.
-        self._done: dict[int, tuple[Any, bytes]] = {}
+        self.operations: set[Any] = set()
+        self.calls = False
+        # Values that occur several times. Each text keeps its value, so that no other value gets its address.
+        self._done: dict[int, tuple[Any, Any]] = {}
+        self._contexts: dict[tuple[int, ...], str] = {}
         self._shapes: dict[Any, str] = {}
         # Functions of packages, which may close over each other.
         self._functions: dict[int, Any] = {}
 
-    def of(self, value: Any) -> bytes:
-        """The hash of a program, or of a parameter of an equation."""
+    def of(self, value: Any) -> Any:
+        """The text of a program, or of a parameter of an equation."""
         kind = type(value)
         if kind in _PLAIN:
-            return _joined(kind.__name__, [repr(value).encode()])
+            return value
+        if kind is tuple:
+            return tuple([x if type(x) in _PLAIN else self.of(x) for x in value])
+        if kind is types.FunctionType:
+            return self._function(value)
+        if id(value) not in self._done:
+            self._done[id(value)] = value, self._text(value, kind)
+        return self._done[id(value)][1]
+
+    def _text(self, value, kind):
         name = f"{kind.__module__}.{kind.__qualname__}"
         if isinstance(value, ClosedJaxpr):
             # From jax 0.12 on, every program is closed.
-            return _joined("closed", [self._program_once(value.jaxpr), *map(self._array, value.consts)])
+            return ["closed", self.of(value.jaxpr), *map(self._array, value.consts)]
         if isinstance(value, Jaxpr):
-            return self._program_once(value)
+            return _hashed(self._program(value))
         if isinstance(value, np.ndarray | np.generic | jax.Array):
             return self._array(value)
         if isinstance(value, Mapping):
             items = sorted(value.items(), key=lambda item: repr(item[0]))
-            return _joined(name, [part for item in items for part in map(self.of, item)])
+            return [name, *(self.of(part) for item in items for part in item)]
         if isinstance(value, list | tuple):
-            return _joined(name, list(map(self.of, value)))
+            return [name, *map(self.of, value)]
         if isinstance(value, set | frozenset):
-            return _joined(name, sorted(map(self.of, value)))
+            return [name, *sorted(_hashed(self.of(x)) for x in value)]
         if isinstance(value, jax.tree_util.PyTreeDef):
-            return _joined(name, [self.of(value.node_data()), *map(self.of, value.children())])
+            return [name, self.of(value.node_data()), *map(self.of, value.children())]
         if isinstance(value, functools.partial):
-            return _joined(name, [self.of(value.func), self.of(value.args), self.of(value.keywords)])
+            return [name, self.of(value.func), self.of(value.args), self.of(value.keywords)]
         if isinstance(value, types.MethodType):
-            return _joined(name, [self.of(value.__func__), self.of(value.__self__)])
-        if isinstance(value, types.FunctionType):
-            return self._function(value)
+            return [name, self.of(value.__func__), self.of(value.__self__)]
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             fields = [(entry.name, getattr(value, entry.name, None)) for entry in dataclasses.fields(value)]
-            return _joined(name, [part for field in fields for part in map(self.of, field)])
+            return [name, *map(self.of, fields)]
         if (wrapped := getattr(value, "__wrapped__", None)) is not None:
-            return _joined(name, [self.of(wrapped)])
-        return _joined(name, [self._shown(value)])
+            return [name, self.of(wrapped)]
+        return [name, self._shown(value)]
 
-    def _program_once(self, program: Any) -> bytes:
-        if id(program) not in self._done:
-            self._done[id(program)] = program, self._program(program)
-        return self._done[id(program)][1]
-
-    def _program(self, program: Any) -> bytes:
+    def _program(self, program: Any) -> Any:
         numbers: dict[Any, int] = {}
+        shapes = self._shapes
 
-        def named(variables: Iterable[Any]) -> list[bytes]:
-            return [f"{numbers.setdefault(v, len(numbers))} {self._shape(v.aval)}".encode() for v in variables]
+        def named(variables: Iterable[Any]) -> list[Any]:
+            return [(numbers.setdefault(v, len(numbers)), shapes.get(v.aval) or self._shape(v.aval)) for v in variables]
 
-        def given(operands: Iterable[Any]) -> list[bytes]:
+        def given(operands: Iterable[Any]) -> list[Any]:
             return [
-                _joined(self._shape(v.aval), [self._array(v.val)])
-                if isinstance(v, Literal)
-                else str(numbers[v]).encode()
-                for v in operands
+                [self._shape(v.aval), self._array(v.val)] if isinstance(v, Literal) else numbers[v] for v in operands
             ]
 
-        parts = named([*program.constvars, *program.invars])
+        text = ["program", named(program.constvars), named(program.invars)]
         for equation in program.eqns:
-            parts += [equation.primitive.name.encode(), *given(equation.invars)]
+            self.operations.add(equation.primitive)
+            parts: list[Any] = [equation.primitive.name, given(equation.invars), self._context(equation)]
             for name, value in sorted(equation.params.items()):
                 if name in RULES:
                     self.rules.add(name)
+                elif name == BATCH_RULE:
+                    rule = _Digest()
+                    parts += [name, rule.of(value)]
+                    self.unknown += rule.unknown
                 elif hasattr(value, "program_of"):
                     operands = [like_of(v.aval) for v in equation.invars]
-                    parts += [name.encode(), self.of(value.program_of(operands))]
+                    parts += [name, self.of(value.program_of(operands))]
                 else:
-                    parts += [name.encode(), self.of(value)]
-            parts += named(equation.outvars)
-        return _joined("program", [*parts, *given(program.outvars)])
+                    parts += [name, value if type(value) in _PLAIN else self.of(value)]
+            text.append([*parts, named(equation.outvars)])
+        return [*text, given(program.outvars)]
 
-    def of_derivative(self, program: Any) -> bytes:
+    def of_derivative(self, program: Any) -> Any:
         """The hash of the derivative of a program, which uses the rules of its equations."""
         function = jaxpr_as_function(program)
         likes = [like_of(x) for x in program.in_avals]
@@ -148,37 +167,49 @@ class _Digest:
             self._shapes[kind] = repr(kind)
         return self._shapes[kind]
 
-    def _array(self, value: Any) -> bytes:
+    def _context(self, equation: Any) -> str:
+        """The settings that an equation was traced with; they live as long as the equation."""
+        key = tuple(map(id, settings_of(equation)))
+        if key not in self._contexts:
+            self._contexts[key] = repr(equation.ctx)
+        return self._contexts[key]
+
+    def _array(self, value: Any) -> Any:
         if isinstance(value, Tracer):
             self.unknown.append(value)
             return b""
         if isinstance(value, jax.Array) and not isinstance(value.dtype, np.dtype):
             # A key of random numbers.
-            return _joined(repr(value.dtype), [self._array(jax.random.key_data(value))])
+            return [repr(value.dtype), self._array(jax.random.key_data(value))]
         array = np.asarray(value)
-        return _joined(f"{array.dtype} {array.shape}", [array.tobytes()])
+        return [f"{array.dtype} {array.shape}", array.tobytes()]
 
-    def _function(self, function: types.FunctionType) -> bytes:
+    def _function(self, function: types.FunctionType) -> Any:
         """A function that is called from Python, as in a callback: a package's function counts by its name and by the
         values that it closes over or has as defaults. Of JAX and its relatives only the name counts.
         """
-        name = f"{function.__module__}.{function.__qualname__}".encode()
+        name = f"{function.__module__}.{function.__qualname__}"
         if not is_installed(function.__code__.co_filename):
             self.unknown.append(function)
-            return _joined("function", [name])
+            return ["function", name]
+        self.calls = True
         if id(function) in self._functions or is_of_jax(function.__module__):
-            return _joined("function", [name])
+            return ["function", name]
         self._functions[id(function)] = function
-        held = [cell.cell_contents for cell in function.__closure__ or () if _is_filled(cell)]
-        held += [function.__defaults__, function.__kwdefaults__]
-        return _joined("function", [name, *map(self.of, held)])
+        return ["function", name, *map(self.of, held_by(function))]
 
-    def _shown(self, value: Any) -> bytes:
+    def _shown(self, value: Any) -> str:
         shown = repr(value)
-        if " at 0x" in shown:
+        if " at 0x" in shown or not _is_of_package(value if isinstance(value, type) else type(value)):
             self.unknown.append(value)
-            return b""
-        return shown.encode()
+            return ""
+        return shown
+
+
+def held_by(function: types.FunctionType) -> list[Any]:
+    """The values that a function closes over or has as defaults."""
+    held = [cell.cell_contents for cell in function.__closure__ or () if _is_filled(cell)]
+    return [*held, function.__defaults__, function.__kwdefaults__]
 
 
 def _is_filled(cell: types.CellType) -> bool:
@@ -188,9 +219,13 @@ def _is_filled(cell: types.CellType) -> bool:
         return False
 
 
-def _joined(tag: str, parts: list[bytes]) -> bytes:
-    """A hash of parts that depends on where each part ends."""
-    digest = hashlib.sha256(tag.encode())
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "little") + part)
-    return digest.digest()
+def _is_of_package(kind: type) -> bool:
+    module = sys.modules.get(kind.__module__)
+    file = getattr(module, "__file__", None)
+    # Modules of the interpreter have no file, and neither has what a user types.
+    return is_installed(file) if file else module is not None and kind.__module__ != "__main__"
+
+
+def _hashed(text: Any) -> bytes:
+    # The second format has no references, which would depend on the identity of objects.
+    return hashlib.sha256(marshal.dumps(text, 2)).digest()

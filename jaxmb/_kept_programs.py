@@ -9,6 +9,8 @@ from pathlib import Path
 
 from ._compat import CacheInterface
 
+# The store and the hash of the `program` that JAX asked for last, in each thread.
+asked = threading.local()
 # The endings that JAX appends to the hash of a program: for the program, and for a file written at each use.
 _PROGRAM, _USED = "-cache", "-atime"
 # The ending of a file that is being written; at this age [s] its process has died.
@@ -34,6 +36,7 @@ class KeptPrograms(CacheInterface):
 
     def get(self, key: str) -> bytes | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The program of this hash, None if there is none."""
+        asked.program = self, key
         try:
             value = self._file(key, _PROGRAM).read_bytes()
         except FileNotFoundError:

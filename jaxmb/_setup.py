@@ -13,6 +13,7 @@ import jax
 
 from ._compat import computes_on_processors, has_started, keep_programs_as, takes_option
 from ._kept_programs import KeptPrograms
+from ._kept_traces import find_by_traces
 
 # Options of XLA for quick compilation. One kernel of a simulation is a few numbers: XLA's older loop emitter gives code
 # that is as fast and compiles in half the time. The disabled passes pay for themselves in large arrays only. A loop
@@ -204,6 +205,7 @@ def _keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int) -> Non
         jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(path))
     keep_programs_as(KeptPrograms)
+    find_by_traces()
 
 
 def kept_in() -> Path | None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from .. import mechanisms
 from .._faulty_versions import fault_of
+from .._kept_traces import TRACE
 from .._machine import cores, limit_of_threads
 from .._results import RESULTS
 from .._setup import VARIABLE, kept_in
@@ -187,12 +188,13 @@ def _kept() -> str:
     if folder is None:
         told = os.environ.get(VARIABLE)
         return "none" + (f", {VARIABLE}={told}" if told else "")
-    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
+    sizes = {path.name: path.stat().st_size for path in folder.glob("*-cache")}
     bound = jax.config.jax_compilation_cache_max_size  # pyright: ignore[reportAttributeAccessIssue]
-    used = f"{sum(sizes) / 2**20:.1f}" + (f" of {bound / 2**20:.0f}" if bound > 0 else "")
+    used = f"{sum(sizes.values()) / 2**20:.1f}" + (f" of {bound / 2**20:.0f}" if bound > 0 else "")
     home = os.path.expanduser("~")
     shown = Path("~") / folder.relative_to(home) if folder.is_relative_to(home) else folder
-    return f"{len(sizes)} in {shown}, {used} MiB"
+    count = sum(not name.startswith(f"{TRACE}-") for name in sizes)
+    return f"{count} in {shown}, {used} MiB"
 
 
 def _first_calls() -> list[list[str]]:

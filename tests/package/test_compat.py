@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import multiprocessing
 import os
+import pickle
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, ClassVar
 
@@ -143,6 +144,60 @@ def test_jax_makes_the_store_of_programs_that_it_is_told(compat, monkeypatch, tm
     store, path = of_jax.get_file_cache(str(tmp_path))
     expected = str(tmp_path), jax.config.jax_compilation_cache_max_size
     assert isinstance(store, Store) and store.made_of == expected and path == str(tmp_path)
+
+
+def test_a_rule_gives_the_executables_of_compiled_functions(compat, monkeypatch):
+    calls = importlib.import_module("jax._src.pjit")
+    monkeypatch.setattr(calls, "_pjit_call_impl_python", calls._pjit_call_impl_python)
+    seen, executables = [], []
+
+    def rule(arrays, params, compile):
+        seen.append((params["name"], compat.goes_anywhere(arrays, params)))
+        executables.append(executables[0] if executables else compile())
+        return executables[-1]
+
+    compat.compile_calls_by(rule)
+    x = np.array([0.3, -0.2])
+    first, second = jax.jit(lambda x: jnp.sin(x) + x), jax.jit(lambda x: jnp.cos(x) + x)
+    np.testing.assert_allclose(first(x), np.sin(x) + x, rtol=1e-15)
+    np.testing.assert_array_equal(second(x), first(x))
+    assert seen == [("<lambda>", True)] * 2, "_pjit_call_impl_python is not called"
+    assert compat.is_pure(executables[0])
+    text = compat.pickled_executable(executables[0], "no program of this name")
+    with pytest.raises(pickle.UnpicklingError, match="the program was dropped"):
+        compat.unpickled_executable(text)
+
+
+def test_calls_that_go_anywhere(compat, monkeypatch):
+    calls = importlib.import_module("jax._src.pjit")
+    monkeypatch.setattr(calls, "_pjit_call_impl_python", calls._pjit_call_impl_python)
+    seen = []
+
+    def rule(arrays, params, compile):
+        seen.append(compat.goes_anywhere(arrays, params))
+        return compile()
+
+    compat.compile_calls_by(rule)
+    x, place = np.ones(2), jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    placed = jax.device_put(x, place)
+    del seen[:]
+    jax.jit(lambda x: x + 1.0)(placed)
+    jax.jit(lambda x: x + 2.0, out_shardings=place)(x)
+    jax.jit(lambda x: (jax.debug.callback(lambda: None), x + 3.0)[1])(x)
+    assert seen == [False] * 3
+
+
+def test_how_operations_are_lowered_and_traced(compat):
+    assert callable(compat.lowering_of(jax.lax.sin_p, "cpu"))
+    assert compat.lowering_of(compat.Primitive("unknown"), "cpu") is None
+
+    def function(x):
+        with compat.not_inlined():
+            y = x * 2.0
+        return x * 2.0 + y
+
+    (one, other, _) = (compat.settings_of(equation) for equation in jax.make_jaxpr(function)(1.0).eqns)
+    assert one != other, "an equation no longer has its metadata for XLA"
 
 
 def test_programs_can_be_read(compat):

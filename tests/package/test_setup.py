@@ -193,11 +193,15 @@ def height(mass):
     return mb.simulate(system, state, t1=0.1, saveat=[0.05, 0.1], rtol=1e-6)["bob"].position[-1, 1]
 
 found = [float(f(2.0)).hex() for f in (height, jax.grad(height), jax.jit(height))]
-print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts["cache_hits"]))
+from jaxmb._kept_traces import _executables
+traces = [executable is not None for each in _executables.values() for executable in each.values()]
+print(dict(found=found, asked=counts["compile_requests_use_cache"], hits=counts["cache_hits"], traces=traces))
 """
     first, second = (process(code, JAXMB_CACHE=str(tmp_path), XLA_FLAGS=QUICKLY)[0] for _ in range(2))
     assert second["found"] == first["found"]
     assert second["hits"] == second["asked"] == first["asked"] > first["hits"]
+    # Large programs by their traces, without lowering them.
+    assert all(second["traces"]) and not any(first["traces"]) and len(second["traces"]) == len(first["traces"]) >= 3
 
 
 def test_the_folder(new_user, tmp_path, monkeypatch):
