@@ -510,8 +510,8 @@ def test_random_programs_have_the_results_of_a_loop(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [x for x in range(100, 118) if x not in FOR_THE_COMPILER])
 def test_random_programs_have_the_results_of_numpy(seed):
-    """XLA optimises as by default. With less, the derivative of a maximum is NaN in program 113: the values are computed
-    again to be compared with the maximum, with other rounding, and none of them is equal to it.
+    """XLA optimises as by default. With less, the derivative of a maximum is NaN in program 113: to be compared with
+    the maximum, the values are computed again with other rounding, and none of them is equal to it.
     """
     given, varies = arguments(seed)
     example = [x[0] if v else x for x, v in zip(given, varies, strict=True)]
