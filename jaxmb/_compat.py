@@ -31,6 +31,7 @@ from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.core import JaxprEqnContext
 from jax._src.interpreters import mlir as lowerings
 from jax._src.interpreters.partial_eval import partial_eval_jaxpr_nounits
+from jax._src.lax import linalg
 from jax._src.named_sharding import UNSPECIFIED
 from jax.core import ShapedArray
 from jax.experimental import serialize_executable
@@ -282,8 +283,11 @@ def pickled_executable(executable: Any, program: str) -> bytes:
 def unpickled_executable(text: bytes) -> Any:
     """The executable of a text, with its program from JAX's folder. It raises any error if it cannot be read.
 
-    (jax._src.compilation_cache.get_executable_and_time, UnloadedMeshExecutable.load, 0.9 to 0.12.)
+    (jax._src.compilation_cache.get_executable_and_time, UnloadedMeshExecutable.load, jax._src.lax.linalg
+    .initialize_lapack, 0.9 to 0.12.)
     """
+    # JAX finds the functions of LAPACK while it lowers a program that calls them.
+    linalg.initialize_lapack()
 
     class Unpickler(serialize_executable._JaxPjrtUnpickler):
         def persistent_load(self, pid) -> Any:

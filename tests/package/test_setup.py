@@ -281,3 +281,23 @@ def test_the_readme_names_each_way_to_compile():
     text = (Path(__file__).parents[2] / "README.md").read_text()
     ways = [way for way in _setup._OPTIONS if way is not None]
     assert len(ways) == 4 and all(f'`"{way}"`' in text for way in ways)
+
+
+def test_a_kept_program_calls_lapack_in_a_process_that_has_lowered_none(tmp_path):
+    """JAX finds LAPACK while it lowers a program, and a program that is found by its trace is not lowered."""
+    code = """
+mb.setup(keep=True, compile=None)
+def singular(x):
+    for _ in range(120):
+        x = jnp.sin(x) + 1.0
+    return jnp.linalg.svd(x @ x.T, compute_uv=False)
+import numpy as np
+given = np.linspace(0.0, 1.0, 9).reshape(3, 3)
+values = jax.jit(singular)(given)
+from jaxmb import _kept_traces
+read = any(x for known in _kept_traces._executables.values() for x in known.values())
+print([read, values.tolist()])
+"""
+    (found, first), (again, second) = (process(code, JAXMB_CACHE=str(tmp_path))[0] for _ in range(2))
+    assert not found and again
+    np.testing.assert_array_equal(first, second)

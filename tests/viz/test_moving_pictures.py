@@ -27,7 +27,9 @@ from jaxmb.viz.solids import solids
 
 MOST_PROGRAMS = 70
 
-G, MASS, INERTIA, ARM = 9.81, 2.0, 0.3, 0.6
+G, MASS, INERTIA, ARM, TIP = 9.81, 2.0, 0.3, 0.6, (0.4, 0.3)
+# Of the pendulum: the node of the plate through its points.
+PLATE = "/solids/mesh 0 of bar"
 
 
 class Page:
@@ -77,7 +79,7 @@ def pendulum():
     bar = planar.Body("bar", mass=MASS, inertia=INERTIA, position=(ARM, 0.0))
     pin = planar.Revolute("pin", "ground", "bar", point_a=(0.0, 0.0), point_b=(-ARM, 0.0))
     spring = planar.SpringDamper("spring", "ground", "bar", stiffness=0.0, point_a=(0.0, 2.0), free_length=1.0)
-    tip = planar.Frame("tip", "bar", position=(0.4, 0.3))
+    tip = planar.Frame("tip", "bar", position=TIP)
     system = mb.Scene([bar], joints=[pin], forces=[spring, mb.Gravity((0.0, -G))], frames=[tip]).compile()
     ts = np.array([0.0, 0.4, 1.0, 1.5, 2.6, 4.0])
     angle, rate = 2 * np.pi * ts / ts[-1], np.full_like(ts, 2 * np.pi / ts[-1])
@@ -112,18 +114,19 @@ def test_page_is_complete(page, pendulum, tmp_path):
 def test_bodies_are_where_they_were_at_the_saved_times(read, pendulum):
     """With springs between their points."""
     _, ts, angle, _ = pendulum
-    assert {"/solids/cylinder", "/solids/coils", "/reactions/pin", "/forces/spring", "/clock", "/grid"} <= read.names()
+    assert {PLATE, "/solids/coils", "/reactions/pin", "/forces/spring", "/clock", "/grid"} <= read.names()
     assert read.duration == pytest.approx(ts[-1], rel=0.02)
-    times, centres = read.values("/solids/cylinder", "batched_positions")
+    times, centres = read.values(PLATE, "batched_positions")
     assert np.allclose(times, ts)
-    # One bar from the mass centre to the pin.
-    middle = 0.5 * ARM * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    assert np.allclose(np.array(centres), middle, atol=3e-4)
-    _, turns = read.values("/solids/cylinder", "batched_wxyzs")
-    axis = np.array([np.asarray(rot.rotation_matrix(np.asarray(p, float)))[:, 2] for p in turns])
-    assert np.allclose(np.abs(np.sum(axis * middle, axis=1)), 0.5 * ARM, atol=3e-4)
-    _, lengths = read.values("/solids/cylinder", "batched_scales")
-    assert len(lengths) == 1 and lengths[0][2] == pytest.approx(ARM, abs=1e-4)
+    # One plate through the mass centre, the pin and the frame.
+    out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert np.allclose(np.array(centres)[:, :2], ARM * out, atol=3e-4)
+    _, turns = read.values(PLATE, "batched_wxyzs")
+    axis = np.array([np.asarray(rot.rotation_matrix(np.asarray(p, float)))[:, 0] for p in turns])
+    assert np.allclose(axis[:, :2], out, atol=3e-4)
+    corners = np.reshape(read.values(PLATE, "vertices")[1][0], (-1, 3))[:, :2]
+    for corner in ((0.0, 0.0), (-ARM, 0.0), TIP):
+        assert np.min(np.linalg.norm(corners - corner, axis=1)) < 1e-3
     clock = read.values("/clock", "text")
     assert np.allclose(clock[0], ts) and [float(text[4:8]) for text in clock[1]] == list(ts)
     start = np.array(read.values("/solids/coils", "batched_positions")[1])
@@ -192,7 +195,7 @@ def test_speed_stretches_and_shortens_the_time_of_playing(pendulum):
     assert np.allclose(times, np.array([0.0, 1.5, 4.0]) / 8) and [float(text[4:8]) for text in texts] == [0.0, 1.5, 4.0]
     assert "/trails/pin" in fast.names()
     # The bodies move at the speed of the clock.
-    assert np.allclose(fast.values("/solids/cylinder", "batched_positions")[0], times)
+    assert np.allclose(fast.values(PLATE, "batched_positions")[0], times)
     short = dataclasses.replace(trajectory, ts=np.asarray(trajectory.ts) / 100)
     times, texts = Page(viz.show(short, points=["pin", "pin"]).html).values("/clock", "text")
     assert times[-1] == pytest.approx(2.0) and "0.02 × real time" in texts[0] and texts[-1].startswith("t = 0.0400 s")
@@ -202,16 +205,14 @@ def test_several_motions_stand_apart_or_together(pendulum):
     trajectory, _, _, _ = pendulum
     apart = Page(viz.show({"before": trajectory, "after": trajectory}, points=["tip"]).html)
     assert {"/before/trails/tip", "/after/trails/tip", "/names/before", "/names/after"} <= apart.names()
-    first, second = (
-        np.array(apart.values(f"/{k}/solids/cylinder", "batched_positions")[1]) for k in ("before", "after")
-    )
+    first, second = (np.array(apart.values(f"/{k}{PLATE}", "batched_positions")[1]) for k in ("before", "after"))
     shift = second - first
     assert np.allclose(shift, shift[0], atol=3e-4)
     assert max(abs(shift[0])) > max(np.ptp(first, axis=0)[:2])
     together = Page(viz.show([trajectory, trajectory], overlay=True).html)
-    first, second = (np.array(together.values(f"/{k}/solids/cylinder", "batched_positions")[1]) for k in ("1", "2"))
+    first, second = (np.array(together.values(f"/{k}{PLATE}", "batched_positions")[1]) for k in ("1", "2"))
     assert np.array_equal(first, second)
-    colors = [together.values(f"/{k}/solids/cylinder", "batched_colors")[1][0] for k in ("1", "2")]
+    colors = [together.values(f"/{k}{PLATE}", "batched_colors")[1][0] for k in ("1", "2")]
     assert not np.array_equal(*colors)
 
 

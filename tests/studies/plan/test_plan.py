@@ -14,7 +14,7 @@ from jaxmb.studies.plan.courses import COURSES
 from jaxmb.studies.plan.guess import Guess
 from jaxmb.studies.plan.solve import arcs_of
 
-MOST_PROGRAMS = 120
+MOST_PROGRAMS = 125
 
 # Exact optima of the linkage without gravity, turned by half a turn from rest to rest. Work and inertia alone determine
 # the least time, T = ∫ √(M / 2 τ Δθ) dθ, with the switch where the works of both torques are equal; Pontryagin's
