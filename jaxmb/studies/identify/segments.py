@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ..._types import State
 from ...manifold import Chart
 from ..batch import batch
+from ..branches import distance
 from ..minimise import Linearised
 from .experiment import ExperimentModel
 from .problem import Model, Problem, numbers, values_and_derivatives, weighted
@@ -132,8 +133,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     _, derivatives, prior_rows, prior_jacobian = values_and_derivatives(problem, place.z)
     n, total = place.z.size, place.size
     residuals, jacobian, scores, score_rows, gaps, closing = [], [], [], [], [], []
-    readings, objective, continuity = {}, 0.5 * prior_rows @ prior_rows, 0.0
-    typical = np.concatenate([problem.system.coordinate_scale(), problem.system.velocity_scale()])
+    readings, objective, continuity, nq = {}, 0.5 * prior_rows @ prior_rows, 0.0, problem.system.nq
     columns = place.split(np.arange(total))
     for lane, charts, lane_columns in zip(lanes, place.charts, columns, strict=True):
         trial, flat = problem.trials[lane.number], _values_of(problem, lane, place.z)
@@ -162,7 +162,8 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
         arrival, change = np.stack([initial, *ends[0][:-1]]), np.stack([first, *end[:-1]])
         places, scales = charts.indices, charts.scales
         # Charts do not tell the branches of the constraints apart.
-        continuity = max(continuity, float(np.max(np.abs(arrival - starts[0]) / typical)))
+        each = zip(arrival, starts[0], strict=True)
+        continuity = max(continuity, *(distance(problem.system, a[:nq], b[:nq]) for a, b in each))
         gaps.append((np.take_along_axis(arrival - starts[0], places, 1) / scales).reshape(-1))
         of_gaps = np.take_along_axis(change - start, places[..., None], 1)
         closing.append((of_gaps / scales[..., None]).reshape(-1, total))
@@ -176,6 +177,7 @@ def evaluated(problem: Problem, lanes: tuple[Lanes, ...], place: Place) -> Model
     plain = Linearised(whole_rows, np.vstack([*jacobian, prior_whole, *score_rows]), objective)
     data = sum(part.size for part in residuals)
     linearised = weighted(problem, plain, data)._replace(gaps=np.concatenate(gaps), closing=np.vstack(closing))
+    continuity = max(continuity, float(np.max(np.abs(linearised.gaps))))
     return Model(linearised, plain, data, (), readings, continuity)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import special
 
 from ...simulate.arguments import DEFAULT_RTOL
+from ..branches import APART
 from .fit import Fit, flat
 from .loss import Loss
 from .residuals import Outlier, Series
@@ -34,8 +35,6 @@ _SHARE = 0.2
 # Two minima fit equally well if twice the logarithm of their likelihood ratio is less than this; their estimates
 # contradict each other if they differ by more than this number of standard deviations.
 _AS_WELL, _APART = 10.0, 5.0
-# A larger gap between segments, relative to typical changes, is a jump.
-_CONTINUOUS = 1e-3
 # The reason for a missing standard deviation of a component that can change without changing the residuals.
 UNDETERMINED = "undetermined"
 
@@ -63,7 +62,7 @@ def judge(fit: Fit) -> Verdict:
     """The objections to the end of an iteration."""
     finite, starts = np.isfinite(fit.ends[0][0]), len(fit.ends)
     doubts = [] if fit.success else ["the iteration did not converge; try another start, or more iterations"]
-    if fit.success and fit.continuity > _CONTINUOUS:
+    if fit.success and fit.continuity > APART:
         doubts.append("its segments end on another branch of the constraints than the next begin; try fewer segments")
     if finite:
         directions, tried = fit.uncertainty.root.shape[1], Tried(starts, fit.segments)

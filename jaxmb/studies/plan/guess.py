@@ -216,11 +216,11 @@ def _given(
     for name, (low, high) in limits.by_name().items():
         if name not in known:
             continue
-        value = low if np.all(low == high) else evaluate(system, state, name, t=t)
-        nearest = np.clip(value, low, high)
+        is_value = np.all(low == high)
+        value = low if is_value else np.asarray(evaluate(system, state, name, t=t))
         # Within its bounds a coordinate follows from others, on which it may depend.
-        if np.all(low == high) or np.any(nearest != value):
-            out[name] = nearest
+        if is_value or np.any((value < low) | (value > high)):
+            out[name] = np.clip(value, low, high)
     return out
 
 

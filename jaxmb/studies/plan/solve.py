@@ -9,6 +9,7 @@ import numpy as np
 
 from ..._types import State
 from ...system import AbstractSystem
+from ..branches import APART, distance
 from .guess import Guess
 from .lanes import MOST_STEPS
 from .problem import Evaluated
@@ -26,9 +27,10 @@ _FIRST_ERROR = 1e-3
 _FURTHER = 4
 # The effect of a control, relative to the largest of any, that is none.
 _NO_EFFECT = 1e-13
-# The distance of coordinates, relative to typical ones, of states on different branches of the constraints.
-_APART = 1e-3
-_JUMP = "; take more intervals, or a guess= nearer to a motion"
+_JUMP = (
+    "at t = {:.4g} s the motion would jump from one branch of the constraints to another; take more intervals, or a "
+    "guess= nearer to a motion"
+)
 # Parts of a control's range: jumps at a node that belong to a switch, and the least sum of them.
 _SMALL_JUMP, _SWITCH = 0.02, 0.4
 
@@ -104,7 +106,7 @@ def solved(
         guesses = guesses if lost else found
         is_last = answer.interrupted or len(log) >= limit or lost or not rounds_left
         if is_last or (steps == before and worn <= _WORN and not moved):
-            answer = answer._replace(success=False, message=apart + _JUMP) if apart else answer
+            answer = answer._replace(success=False, message=apart) if apart else answer
             return _each_phase(program, answer, guesses, tuple(log), errors)
     raise AssertionError("unreachable")
 
@@ -137,30 +139,31 @@ def _rejoined(program: Program, found: list[Guess]) -> tuple[str, bool]:
 
     **Returns:** the first such place in words, and whether nodes moved.
     """
-    places, moved = [], False
+    jumps, moved, before = [], False, None
     for phase, (part, at) in enumerate(zip(program.parts, program.intervals(), strict=True)):
         task, (states, ts, *_) = part.task, found[phase]
-        arrivals = _arrivals(states, at)
+        system, arrivals = task.system, _arrivals(states, at)
+        if before is not None and _are_apart(*before, system, states.q[0]):
+            jumps.append(ts[0])
         for k in range(1, task.intervals + 1):
-            if _apart(task.system, arrivals[k - 1, : task.system.nq], states.q[k]):
-                places.append(ts[k])
+            if distance(system, arrivals[k - 1, : system.nq], states.q[k]) > APART:
+                jumps.append(ts[k])
                 if k < task.intervals or not isinstance(task.end, State):
                     states, moved = _replaced(states, k, arrivals[k - 1]), True
         found[phase] = found[phase]._replace(states=states)
-        if task.periodic and _apart(task.system, states.q[-1] - full_turns(task.system, states), states.q[0]):
-            places.append(ts[-1])
-    where = (
-        f"at t = {min(places, default=0.0):.4g} s the motion would jump from one branch of the constraints to another"
-    )
-    return where if places else "", moved
+        if task.periodic and distance(system, states.q[-1] - full_turns(system, states), states.q[0]) > APART:
+            jumps.append(ts[-1])
+        before = system, states.q[-1]
+    return (_JUMP.format(jumps[0]) if jumps else ""), moved
 
 
-def _apart(system: AbstractSystem, a: Any, b: Any) -> bool:
-    a = np.array(a)
-    for name, where in system.coordinate_names().items():
-        if name.endswith(".orientation") and np.dot(a[where], b[where]) < 0:
-            a[where] *= -1.0
-    return bool(np.max(np.abs(a - b) / system.coordinate_scale(), initial=0.0) > _APART)
+def _are_apart(system: AbstractSystem, q: Any, other_system: AbstractSystem, other: Any) -> bool:
+    """Whether the coordinates that two systems share by name are on different branches."""
+    places, others = system.coordinate_names(), other_system.coordinate_names()
+    shared = np.array(other)
+    for name in places.keys() & others.keys():
+        shared[others[name]] = np.asarray(q)[places[name]]
+    return distance(other_system, shared, other) > APART
 
 
 def _each_phase(program, answer, guesses, log, errors):

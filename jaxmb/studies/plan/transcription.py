@@ -20,6 +20,7 @@ from ..._types import State
 from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...system import AbstractSystem
+from ..branches import signs_like
 from .guess import Guess, with_turns
 from .lanes import AbstractLane, Arrival, Block, Look, Model, Strike, in_lanes
 from .problem import Evaluated, Problem, Term
@@ -483,10 +484,7 @@ class _Transcriber:
         """The end is the start, up to turns of angles and the signs of Euler parameters, which the guess tells."""
         system, places, indices, scales = self.task.system, self.places, self.nodes.charts[1][0], self.nodes.scales[0]
         q, further = self.guess.states.q, np.zeros(system.nu + system.nz)
-        signs = np.ones(system.nq)
-        for name, where in system.coordinate_names().items():
-            if name.endswith(".orientation") and np.dot(q[0, where], q[-1, where]) < 0:
-                signs[where] = -1.0
+        signs = signs_like(system, q[-1], q[0])
         shift = np.append(full_turns(system, self.guess.states), further)[indices] / scales
         rows = self._rows("period", ["period"] * scales.size, shift, shift)
         last = (self.task.intervals - 1) * self.terms[0].outputs

@@ -14,7 +14,7 @@ from jaxmb.studies.plan.courses import COURSES
 from jaxmb.studies.plan.guess import Guess
 from jaxmb.studies.plan.solve import arcs_of
 
-MOST_PROGRAMS = 125
+MOST_PROGRAMS = 120
 
 # Exact optima of the linkage without gravity, turned by half a turn from rest to rest. Work and inertia alone determine
 # the least time, T = ∫ √(M / 2 τ Δθ) dθ, with the switch where the works of both torques are equal; Pontryagin's
@@ -141,8 +141,8 @@ def test_plan_to_another_branch_of_the_constraints_does_not_succeed(system):
     mirrored = crank + 2 * along * np.dot(pin - crank, along) - (pin - crank)
     angles = [np.arctan2(*(mirrored - pivot)[::-1]) for pivot in (crank, rocker)]
     places = [*here.q[:3], *(crank + mirrored) / 2, angles[0], *(rocker + mirrored) / 2, angles[1]]
-    crossed = mb.assemble(system, mb.State(jnp.array(places), here.u), fix={"crank.angle": 1.57})
-    np.testing.assert_allclose(crossed.q, places, rtol=0, atol=1e-12)
+    crossed = mb.State(np.array(places), np.asarray(here.u))
+    np.testing.assert_allclose(system.coordinate_residual(0.0, crossed.q), 0.0, atol=1e-12)
     plan = mb.plan(system, controls=FREE, duration=2.0, running="effort", start=here, end=crossed, intervals=8)
     assert not plan.success and "at t = 2 s the motion would jump" in plan.message
 
