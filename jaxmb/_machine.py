@@ -24,3 +24,14 @@ def limit_of_threads() -> int | None:
         if re.fullmatch(r"[+-]?[0-9]+", given) and abs(int(given)) < 2**31:
             return max(int(given), 1)
     return None
+
+
+def use_one_thread_in_lapack() -> None:
+    """Let LAPACK, which XLA calls, compute with one thread, unless the environment has a number.
+
+    It has an effect before SciPy is loaded.
+    OpenBLAS shares out triangular solutions from eight columns on, and its threads wait for each other in loops: on
+    cores that other processes use, a motion takes a hundred times as long.
+    """
+    if not {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"} & os.environ.keys():
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"

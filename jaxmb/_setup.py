@@ -14,6 +14,7 @@ import jax
 from ._compat import computes_on_processors, has_started, keep_programs_as, takes_option
 from ._kept_programs import KeptPrograms
 from ._kept_traces import find_by_traces
+from ._machine import use_one_thread_in_lapack
 
 # Options of XLA for quick compilation. One kernel of a simulation is a few numbers: XLA's older loop emitter gives code
 # that is as fast and compiles in half the time. The disabled passes pay for themselves in large arrays only. A loop
@@ -93,7 +94,8 @@ def setup(
         machines run in a third to three quarters of the time. With `"for batches"` members of `jaxmb.batch` and `sweep`
         are computed side by side, and values of a `jax.vmap`. Results differ in rounding. These set options of XLA
         for processors in the environment variable `XLA_FLAGS`; options that are set there already stay. With `None`, or
-        if JAX has an accelerator, no options are set.
+        if JAX has an accelerator, no options are set. LAPACK computes with one thread but with `None`, or where
+        `OPENBLAS_NUM_THREADS` or `OMP_NUM_THREADS` is in the environment.
         With `"later"`, for modelling, no first call waits for the compiler. NumPy computes it, and the compiler works
         in the background, with the options of `"quickly"`. Digits and numbers of steps change within the tolerance when
         the program is there, so finite differences, sweeps and tests need another choice.
@@ -117,6 +119,7 @@ def setup(
         jax.config.update("jax_enable_x64", True)
     if compile is not None:
         _look_for_garbage_less_often()
+        use_one_thread_in_lapack()
     _tell(_OPTIONS[compile] if computes_on_processors() else {})
     if keep is not False:
         _keep_programs(None if keep is True else keep, max_bytes)

@@ -15,6 +15,7 @@ from compiling import QUICKLY
 import jaxmb as mb
 from jaxmb import _setup
 from jaxmb._compat import computes_on_processors, takes_option
+from jaxmb._machine import cores
 
 # Counts of the programs that JAX asked for, and of those that it found.
 COUNTING = """
@@ -281,6 +282,22 @@ def test_the_readme_names_each_way_to_compile():
     text = (Path(__file__).parents[2] / "README.md").read_text()
     ways = [way for way in _setup._OPTIONS if way is not None]
     assert len(ways) == 4 and all(f'`"{way}"`' in text for way in ways)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="Threads are counted where the system lists them.")
+def test_lapack_has_one_thread_unless_the_environment_has_a_number():
+    code = """
+import os
+os.environ.pop("OMP_NUM_THREADS", None), os.environ.pop("OPENBLAS_NUM_THREADS", None)
+os.environ.update({})
+mb.setup(keep=False)
+before = len(os.listdir("/proc/self/task"))
+import scipy.linalg
+print(len(os.listdir("/proc/self/task")) - before)
+"""
+    given = code.replace("update({})", "update(OPENBLAS_NUM_THREADS='2')")
+    # OpenBLAS starts no more threads than there are cores.
+    assert [process(each)[0] for each in (code, given)] == [0, min(cores(), 2) - 1]
 
 
 def test_a_kept_program_calls_lapack_in_a_process_that_has_lowered_none(tmp_path):

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..._types import State
 from ...manifold import Chart
 from ..batch import batch
-from ..branches import distance
+from ..constraint_branches import distance
 from ..minimise import Linearised
 from .experiment import ExperimentModel
 from .problem import Model, Problem, numbers, values_and_derivatives, weighted

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from ...simulate.arguments import DEFAULT_RTOL
-from ..branches import APART
+from ..constraint_branches import APART
 from .fit import Fit, flat
 from .loss import Loss
 from .residuals import Outlier, Series

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._types import State
 from ...system import AbstractSystem
-from ..branches import APART, distance
+from ..constraint_branches import APART, distance
 from .guess import Guess
 from .lanes import MOST_STEPS
 from .problem import Evaluated

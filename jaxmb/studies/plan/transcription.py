@@ -20,7 +20,7 @@ from ..._types import State
 from ...linalg.jitted import jitted
 from ...manifold import Chart
 from ...system import AbstractSystem
-from ..branches import signs_like
+from ..constraint_branches import signs_like
 from .guess import Guess, with_turns
 from .lanes import AbstractLane, Arrival, Block, Look, Model, Strike, in_lanes
 from .problem import Evaluated, Problem, Term

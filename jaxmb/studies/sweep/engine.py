@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from ..._compat import processes_of
-from ..._machine import cores, limit_of_threads
+from ..._machine import cores, limit_of_threads, use_one_thread_in_lapack
 from ..._setup import SETTINGS
 from .chunk import Job, Task, Work
 from .dataset import packages
@@ -129,6 +129,7 @@ def _start_worker(threads: int) -> None:
     # Read when JAX first computes, and so late enough here.
     if limit_of_threads() is None:
         os.environ["NPROC"] = str(threads)
+    use_one_thread_in_lapack()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

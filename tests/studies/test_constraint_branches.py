@@ -5,7 +5,7 @@ import pytest
 
 import jaxmb as mb
 from jaxmb import planar, spatial
-from jaxmb.studies.branches import distance, signs_like
+from jaxmb.studies.constraint_branches import distance, signs_like
 
 MOST_PROGRAMS = 20
 
