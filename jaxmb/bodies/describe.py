@@ -84,6 +84,6 @@ def _left_out_by_elimination(system) -> list[str]:
     if order is not None:
         out.append(f"the dense Jacobian and charts, with Adams: {order}")
     if system.implicit_in_blocks:
-        joined = f"{system.layout.bodies} bodies" + " with the joints" * (order is not None)
+        joined = f"{system.layout.bodies} bodies" + " with the joints" * (system.acceleration_rows > 0)
         out.append(f"the dense Newton matrix, with Hermite: sparse elimination of {joined}")
     return out

@@ -39,9 +39,13 @@ from .motion import coordinate_names, rate_names
 from .parameters import SceneParameters
 from .state_table import StateTable
 
-# From this number of velocities on, implicit methods eliminate in blocks. (A step of eight cars with draft gears, 24
-# velocities: 0.5 ms in blocks, 6.4 ms with dense matrices. Dense matrices of small machines with joints are cheap.)
+# From this number of velocities on, implicit methods eliminate in blocks with the joints. (Dense matrices of small
+# machines with joints are cheap.)
 _LEAST_VELOCITIES = 40
+# From this number of freedoms on, they do so with joints too few for block elimination, and with none. (A step of eight
+# cars with draft gears, 24 freedoms: 0.5 ms in blocks, 6.4 ms by dense matrices; of a planar chain of beams on a pin,
+# 39 freedoms: 0.35 and 1.0 ms, 145: 0.8 and 32 ms. A chain of rods, 14 freedoms: 0.7 and 0.4 ms.)
+_LEAST_FREEDOMS = 24
 
 
 class Implied(NamedTuple):
@@ -422,9 +426,11 @@ class RigidBodySystem(AbstractSystem):
 
     @property
     def implicit_in_blocks(self) -> bool:
-        in_blocks = self.elimination is not None or self.acceleration_rows == 0
         plain = self.ideal_on_velocities and self.has_field_jacobian and not self.layout.flexible
-        return plain and in_blocks and self.nu >= _LEAST_VELOCITIES
+        if self.elimination is not None:
+            return plain and self.nu >= _LEAST_VELOCITIES
+        independent = self.linear and self.acceleration_rank == self.acceleration_rows
+        return plain and independent and self.nu - self.velocity_rank >= _LEAST_FREEDOMS
 
     def field_jacobian(self, t, y):
         return motion_jacobian(self, t, y)

@@ -52,5 +52,6 @@ def default_manifold(
     if not isinstance(solver, AbstractMultistep):
         return _PROJECTION
     # Block elimination serves multipliers only: it does not select independent columns.
-    in_blocks = system.elimination is not None and (formulation is None or formulation.takes_blocks)
-    return _PROJECTION if in_blocks and (system.implicit_in_blocks or not implicit) else _PARTITION
+    multipliers = formulation is None or formulation.takes_blocks
+    in_blocks = system.implicit_in_blocks if implicit else system.elimination is not None
+    return _PROJECTION if in_blocks and multipliers else _PARTITION

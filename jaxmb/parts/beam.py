@@ -123,7 +123,12 @@ class AbstractElasticBeam(AbstractBeam, AbstractPotentialForce):
 
     def _stiffness(self, space):
         bending = self.section.bending(space.dimension)
-        return jnp.append(self.section.extension(space.dimension), bending) if self.extends else bending
+        if not self.extends:
+            return bending
+        extension = self.section.extension(space.dimension)
+        # A shear force bends the beam between its middle and its ends. Shear along y bends about z, along z about y.
+        compliance = 1 / extension[1:] + self.length**2 / (12 * bending[::-1][: space.dimension - 1])
+        return jnp.concatenate([extension[:1], 1 / compliance, bending])
 
     def _stress(self, space):
         stiffness = self._stiffness(space)
@@ -146,8 +151,8 @@ class AbstractElasticBeam(AbstractBeam, AbstractPotentialForce):
 
 
 class Beam(AbstractElasticBeam):
-    """An elastic beam: a geometrically exact element with one point of integration. It resists extension, shear,
-    bending and torsion, for any rotation of its bodies.
+    """An elastic beam: a geometrically exact element with one point of integration, exact for small deflections. It
+    resists extension, shear, bending and torsion, for any rotation of its bodies.
 
     ```python
     strip = jaxmb.sections.Rectangle(thickness=2e-3, width=0.02, modulus=2.1e11, poisson_ratio=0.3)
@@ -159,15 +164,17 @@ class Beam(AbstractElasticBeam):
     ```
 
     Its energy is `length / 2` times the sum of `stiffness (strain − free strain)²`, over the strains Γ (extension and
-    shear) and κ (torsion and bending). It has no mass; the bodies have it. Its error falls with the square of its
-    length: `beam_chain` makes a chain of beams. In space the sections turn relative to each other by less than half a
-    turn; the moment jumps there.
+    shear) and κ (torsion and bending). In the stiffness k of shear, `1 / k = 1 / (G A) + length² / (12 E I)`, so that a
+    beam of any length has the small deflections of Timoshenko's beam with loads at its ends. It has no mass; the bodies
+    have it. For large deflections its error falls with the square of its length: `beam_chain` makes a chain of beams.
+    In space the sections turn relative to each other by less than half a turn; the moment jumps there.
 
     Along a motion it has `strain` Γ and `curvature` κ [1/m], and in the axes of its middle section `section_force` [N]
     (tension, shear forces) and `section_moment` [N m] (torsion and bending; in the plane a number).
 
-    Source: J. C. Simo, "A finite strain beam formulation. The three-dimensional dynamic problem. Part I", Comput.
-    Methods Appl. Mech. Eng. 49, 1985.
+    Sources: J. C. Simo, "A finite strain beam formulation. The three-dimensional dynamic problem. Part I", Comput.
+    Methods Appl. Mech. Eng. 49, 1985; R. H. MacNeal, "A simple quadrilateral shell element", Comput. Struct. 8, 1978
+    (residual bending flexibility).
     """
 
     extends: ClassVar[bool] = True

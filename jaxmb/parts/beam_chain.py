@@ -49,9 +49,11 @@ def beam_chain(
 
     The bodies are `"blade_node0"` to `"blade_node4"`, at the points, with their x axes along the beam; the beams are
     `"blade1"` to `"blade4"`. Welds `"blade_start"` and `"blade_end"` hold the ends; their reactions are the forces at
-    the clamps. A node has half of the mass of each beam at it, with the inertia of this half about the node. Errors
-    fall with the square of n, so that `(4 x₂ₙ - xₙ) / 3` is closer than both. A number of all beams at once is a
-    `jaxmb.Variable` of `jaxmb.design`.
+    the clamps. A node has half of the mass of each beam at it, with the inertia of its section; the nodes near both
+    ends have other shares, by which a straight chain of equal beams has the inertia of the rod. A node of an
+    inextensible chain has the halves, with the inertia of a rod. Errors fall with the square of n, so that `(4 x₂ₙ -
+    xₙ) / 3` is closer than both; those of small deflections of elastic beams with its fourth power. A number of all
+    beams at once is a `jaxmb.Variable` of `jaxmb.design`.
 
     **Arguments:**
 
@@ -75,7 +77,7 @@ def beam_chain(
     if not np.all(lengths > 0):
         raise ValueError(f"beam_chain {name!r}: neighbouring points coincide; leave one out.")
     names = [f"{name}_node{k}" for k in range(len(places))]
-    bodies = _nodes(names, places, section, mass * lengths / np.sum(lengths), y)
+    bodies = _nodes(names, places, section, mass * lengths / np.sum(lengths), y, inextensible)
     kind = InextensibleBeam if inextensible else Beam
     numbered = enumerate(itertools.pairwise(names), start=1)
     beams = [kind(f"{name}{k}", *pair, section=section, damping_time=damping_time) for k, pair in numbered]
@@ -85,13 +87,17 @@ def beam_chain(
     return BeamChain(bodies, [*welds, *beams], []) if inextensible else BeamChain(bodies, welds, beams)
 
 
-def _nodes(names, places, section, masses, y):
+def _nodes(names, places, section, masses, y, inextensible):
     """The bodies at the nodes, from the masses of the beams between them."""
     d = places.shape[1]
     ways = np.diff(places, axis=0)
-    squares = np.sum(ways**2, axis=1)
-    halves = lambda values: np.convolve(values, (0.5, 0.5))
-    mass, along = halves(masses), halves(masses * squares / 12)
+    lengths = np.linalg.norm(ways, axis=1)
+    if inextensible:
+        # With this inertia errors of the strains and of the kinetic energy of waves cancel.
+        mass, along = (np.convolve(values, (0.5, 0.5)) for values in (masses, masses * lengths**2 / 12))
+    else:
+        mass = _with_ends(masses, lengths)
+        along = np.zeros_like(mass)
     if not (missing := section.missing(d, extends=True)):
         # Squares of the radii of gyration.
         gyration = np.asarray(section.bending(d))[d - 2 :] / np.asarray(section.extension(d))[0]
@@ -110,6 +116,21 @@ def _nodes(names, places, section, masses, y):
     return [
         SpatialBody(name, mass=m, inertia=np.diag(i), position=at, orientation=turn) for name, m, i, at, turn in rows
     ]
+
+
+def _with_ends(masses: Any, lengths: Any) -> Any:
+    """The masses of the nodes between the halves of elastic beams, changed near both ends.
+
+    Halves are the trapezoidal rule for the kinetic energy; with these ends it is Gregory's rule of fourth order, and
+    Simpson's for two beams. It is for beams of similar length there.
+    """
+    out = np.convolve(masses, (0.5, 0.5))
+    for nodes, m, l in ((out, masses, lengths), (out[::-1], masses[::-1], lengths[::-1])):
+        if len(l) > 1 and 0.5 <= l[0] / l[1] <= 2.0:
+            both = l[0] + l[1]
+            near, far = m[0] * both / (12 * l[1]), m[0] * l[0] ** 2 / (12 * l[1] * both)
+            nodes[:3] += far - near, near, -far
+    return out
 
 
 def _attitudes(tangents, y):

@@ -1,6 +1,4 @@
-"""Beams: closed forms of one element, and published values of chains, to which they converge with the square of their
-number.
-"""
+"""Beams: closed forms of one element, and published values of chains, to which they converge."""
 
 import functools
 import itertools
@@ -74,6 +72,14 @@ def test_stiffnesses_of_shapes():
 # One element
 
 
+def of_bending(bending, shear):
+    """The stiffness of a beam against a deflection and a turn of its end, by Timoshenko's theory (J. S. Przemieniecki,
+    "Theory of Matrix Structural Analysis", McGraw-Hill 1968, section 5.6).
+    """
+    phi = 12 * bending / (shear * L**2)
+    return bending / (L**3 * (1 + phi)) * np.array([[12.0, -6 * L], [-6 * L, (4 + phi) * L**2]])
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def observed(space, part, poses, velocities):
     """The quantities at several poses and velocities."""
@@ -81,13 +87,14 @@ def observed(space, part, poses, velocities):
 
 
 def test_stiffness_at_rest_is_that_of_the_element_of_timoshenko():
-    """Of a displacement and a turn of B, with the strain of the middle, by forward and by reverse mode."""
+    """Of a displacement and a turn of B, as of the exact solution, by forward and by reverse mode."""
     part, given = resolved(PLANE, planar.Beam("F", "a", "b", section=ALONG))
     energy = lambda x: part.energy(PLANE, jnp.stack([jnp.asarray(given[0]), given[1] + x]), 0.0)
     found = jax.jit(lambda x: (jax.hessian(energy)(x), jax.jacrev(jax.grad(energy))(x), jax.grad(energy)(x)))(
         np.zeros(3)
     )
-    expected = [[EA / L, 0, 0], [0, GA / L, -GA / 2], [0, -GA / 2, EI / L + GA * L / 4]]
+    expected = np.diag([EA / L, 0.0, 0.0])
+    expected[1:, 1:] = of_bending(EI, GA)
     for matrix in found[:2]:
         np.testing.assert_allclose(matrix, expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found[2], 0.0, atol=1e-13)
@@ -103,9 +110,10 @@ def test_stiffness_at_rest_in_space():
         poses = jnp.stack([jnp.asarray(given[0]), pose])
         return part.wrenches(SPACE, poses, jnp.zeros((2, 6)), 0.0)[1]
 
-    expected = np.diag([EA / L, 50.0 / L, GA / L, 3.0 / L, 2.0 / L + GA * L / 4, EI / L + 50.0 * L / 4])
-    expected[1, 5] = expected[5, 1] = -50.0 / 2
-    expected[2, 4] = expected[4, 2] = GA / 2
+    expected = np.diag([EA / L, 0.0, 0.0, 3.0 / L, 0.0, 0.0])
+    expected[np.ix_([1, 5], [1, 5])] = of_bending(EI, 50.0)
+    # A deflection along z goes with a turn about -y.
+    expected[np.ix_([2, 4], [2, 4])] = of_bending(2.0, GA) * [[1, -1], [-1, 1]]
     np.testing.assert_allclose(jax.jit(jax.jacfwd(wrench))(np.zeros(6)), -expected, rtol=0, atol=1e-12)
 
 
@@ -144,7 +152,7 @@ def test_stretch_shear_and_damping():
     poses, velocities = given + np.array([[0.0] * 3, [0.02, 0.01, 0.0]]), np.array([[0.0] * 3, [0.3, -0.2, 0.0]])
     seen = observed(PLANE, part, poses[None], velocities[None])
     wrenches = np.asarray(jax.jit(lambda q, v: part.wrenches(PLANE, q, v, 0.0))(poses, velocities))
-    force = np.array([EA * (0.02 + 0.1 * 0.3), GA * (0.01 - 0.1 * 0.2)]) / L
+    force = np.array([EA / L * (0.02 + 0.1 * 0.3), of_bending(EI, GA)[0, 0] * (0.01 - 0.1 * 0.2)])
     np.testing.assert_allclose(seen["section_force"][0], force, rtol=1e-13)
     np.testing.assert_allclose(wrenches[1, :2], -force, rtol=1e-12)
     # Without bending the moments of both ends are equal, and balance the pair of forces.
@@ -239,21 +247,57 @@ def line(n, length=1.0, dimension=2):
 
 
 def test_nodes_of_a_chain():
-    """Their mass, mass centre, and inertia about the middle are those of the beam, up to the square of an element."""
-    n, mass = 4, 3.0
+    """Their mass, mass centre, and inertia about the middle are those of the beam."""
+    n, length, mass = 6, 2.0, 3.0
+    cell = mass / n
     strip = sections.Rectangle(thickness=0.1, width=0.3, modulus=1.0, poisson_ratio=0.3)
-    for space, points in ((planar, line(n, 2.0)), (spatial, line(n, 2.0, 3))):
+    for space, points in ((planar, line(n, length)), (spatial, line(n, length, 3))):
         own = space.beam_chain("b", points, strip, mass=mass, ends=("ground", "other"), damping_time=0.2)
         assert [body.name for body in own.bodies] == [f"b_node{k}" for k in range(n + 1)]
-        assert [part.name for part in (*own.joints, *own.forces)] == ["b_start", "b_end", "b1", "b2", "b3", "b4"]
-        assert [part.bodies for part in own.joints] == [("ground", "b_node0"), ("other", "b_node4")]
+        assert [part.name for part in (*own.joints, *own.forces)] == [
+            "b_start",
+            "b_end",
+            *(f"b{k}" for k in range(1, n + 1)),
+        ]
+        assert [part.bodies for part in own.joints] == [("ground", "b_node0"), ("other", "b_node6")]
         assert all(part.damping_time == 0.2 for part in own.forces)
         masses = np.array([body.mass for body in own.bodies])
-        np.testing.assert_allclose(masses, mass * np.array([1, 2, 2, 2, 1]) / 8, rtol=1e-14)
-        about_z = [body.inertia if space is planar else body.inertia[2, 2] for body in own.bodies]
-        np.testing.assert_allclose(about_z, masses * (0.01 / 12 + 0.25 / 12), rtol=1e-14)
-    inertia = np.diag(own.bodies[1].inertia) / masses[1]
-    np.testing.assert_allclose(inertia, [(0.01 + 0.09) / 12, (0.09 + 0.25) / 12, (0.01 + 0.25) / 12], rtol=1e-13)
+        np.testing.assert_allclose(masses, cell * np.array([9, 28, 23, 24, 23, 28, 9]) / 24, rtol=1e-13)
+        about_z = np.array([body.inertia if space is planar else body.inertia[2, 2] for body in own.bodies])
+        np.testing.assert_allclose(about_z, masses * 0.01 / 12, rtol=1e-13)
+        places = np.array(points)[:, 0] - length / 2
+        whole = mass * (length**2 + 0.01) / 12
+        np.testing.assert_allclose(
+            [np.sum(masses * places), np.sum(about_z + masses * places**2)], [0.0, whole], atol=1e-12
+        )
+    radii = np.array([0.01 + 0.09, 0.09, 0.01]) / 12
+    np.testing.assert_allclose(np.diag(own.bodies[1].inertia) / masses[1], radii, rtol=1e-13)
+    hard = planar.beam_chain("b", line(n, length), strip, mass=mass, inextensible=True)
+    halves = cell * np.array([0.5, 1, 1, 1, 1, 1, 0.5])
+    np.testing.assert_allclose([body.mass for body in hard.bodies], halves, rtol=1e-13)
+    radius = (0.01 + (length / n) ** 2) / 12
+    np.testing.assert_allclose([body.inertia for body in hard.bodies], halves * radius, rtol=1e-13)
+
+
+@pytest.mark.parametrize("lengths", [(1.0,), (1.0, 1.0), (1.0, 1.4, 0.8), (3.0, 1.0, 1.0), (1.0, 0.1, 4.0)])
+def test_nodes_between_beams_of_several_lengths(lengths):
+    """Each has a mass, and all together have that of the beam."""
+    places = np.concatenate([[0.0], np.cumsum(lengths)])
+    own = planar.beam_chain("b", np.stack([places, 0 * places], axis=1), ALONG, mass=places[-1])
+    masses = np.array([body.mass for body in own.bodies])
+    assert np.all(masses > 0)
+    np.testing.assert_allclose(np.sum(masses), places[-1], rtol=1e-13)
+
+
+def test_frequencies_of_an_elastic_chain():
+    """Of a thin cantilever. They err by the fourth power of the length of a beam: with 4 beams by twenty times as much,
+    and with 8 inextensible beams by 0.7 percent.
+    """
+    thin = sections.Section(bending_stiffness=1.0, axial_stiffness=1e6, shear_stiffness=1e6)
+    own = planar.beam_chain("b", line(8), thin, mass=1.0)
+    system = mb.Scene(own.bodies, joints=own.joints, forces=own.forces).compile()
+    frequencies = mb.linearise(system, mb.assemble(system)).frequencies[:4:2]
+    assert np.all(np.abs(frequencies / np.array([3.5160152687, 22.0344915644]) - 1) < [1e-4, 5e-4])
 
 
 def test_chain_along_a_curve():
@@ -362,15 +406,17 @@ def bend(n):
 
 @pytest.mark.slow
 def test_curved_cantilever_in_space():
-    """Sixteen arcs have the published deflection, and the error of eight straight beams is four times as large."""
+    """Sixteen arcs, and eight straight beams, against the differential equations; a published deflection by sixteen
+    elements, without the residual bending flexibility, differs from these by 0.024.
+    """
     start = arc(np.array([np.pi / 4]))[0]
     fine = at_end(bend(16)) - start
-    np.testing.assert_allclose(fine, [-23.795, -13.719, 53.588], rtol=0, atol=2e-3)
     extension, bending = np.asarray(SQUARE.extension(3)), np.asarray(SQUARE.bending(3))
     end, _ = tip(RADIUS * np.pi / 4, extension, bending, UP, (0.0, 0.0, 1 / RADIUS))
-    np.testing.assert_allclose(fine, end - start, rtol=0, atol=0.03)
+    np.testing.assert_allclose(end - start, [-23.795, -13.719, 53.588], rtol=0, atol=0.024)
+    np.testing.assert_allclose(fine, end - start, rtol=0, atol=0.018)
     straight = at_end(chain(spatial, arc(np.linspace(0.0, np.pi / 4, 9)), SQUARE, UP)) - start
-    np.testing.assert_allclose(straight, end - start, rtol=0, atol=0.13)
+    np.testing.assert_allclose(straight, end - start, rtol=0, atol=0.045)
 
 
 @pytest.mark.slow
@@ -616,10 +662,11 @@ STRIP = chain(planar, line(2), sections.Rectangle(width=0.3, poisson_ratio=0.3, 
 
 def check_derivatives(of, *, rtol):
     """Forward mode, and reverse mode under `jit`, against each other and central differences."""
-    x, steps = jnp.ones(4), 1e-4 * np.eye(4)
+    x, steps = jnp.ones(4), 2e-5 * np.eye(4)
     forward = np.asarray(jax.jacfwd(of)(x))
     np.testing.assert_allclose(jax.jit(jax.jacrev(of))(x), forward, rtol=1e-8, atol=1e-10 * np.max(np.abs(forward)))
-    differences = np.stack([(np.asarray(of(x + step)) - np.asarray(of(x - step))) / 2e-4 for step in steps], axis=1)
+    between = lambda step: np.asarray(of(x + step)) - np.asarray(of(x - step))
+    differences = np.stack([(8 * between(step) - between(2 * step)) / 2.4e-4 for step in steps], axis=1)
     np.testing.assert_allclose(forward, differences, rtol=rtol, atol=rtol * np.max(np.abs(differences)))
 
 
@@ -655,7 +702,7 @@ def test_free_flight_keeps_energy_and_momentum(inextensible):
     motion = mb.simulate(
         system, mb.assemble(system, rates=rates), t1=0.5, rtol=1e-10, atol=1e-12, saveat=np.linspace(0, 0.5, 6)
     )
-    bent = np.abs(motion["b2"].curvature[-1])
+    bent = np.max(np.abs(motion["b2"].curvature), axis=0)
     assert np.all(bent > 1e-3)
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-8)
     masses = np.array([body.mass for body in own.bodies])

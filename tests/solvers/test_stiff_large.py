@@ -75,6 +75,15 @@ def tower(n):
     return mb.Scene(bodies, forces=[mb.Gravity((0.0, 0.0, -9.81)), *forces]).compile()
 
 
+def strip(n):
+    """Elastic beams on a pin: two constraint rows, and a freedom for every other velocity."""
+    section = mb.sections.Rectangle(thickness=0.02, width=0.02, modulus=5e6, poisson_ratio=0.45)
+    nodes = np.linspace((0.0, 0.0), (1.0, 0.0), n)
+    own = planar.beam_chain("strip", nodes, section, mass=0.44, ends=(None, None), damping_time=1e-3)
+    pin = planar.Revolute("pin", "ground", "strip_node0", point_a=(0.0, 0.0), point_b=(0.0, 0.0))
+    return mb.Scene(own.bodies, joints=[pin], forces=[*own.forces, mb.Gravity((0.0, -9.81))]).compile()
+
+
 def moving(system, seed=0):
     """A state on the constraints with some velocities and angles."""
     random = np.random.default_rng(seed)
@@ -105,7 +114,7 @@ def dense_resolvent(system, y, x, r):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 5), (tower, 3)])
+@pytest.mark.parametrize("build, n", [(chain, 12), (cable, 5), (tower, 3), (strip, 5)])
 def test_resolvents_are_those_of_dense_matrices(build, n):
     system = build(n)
     y = moving(system)
@@ -167,7 +176,9 @@ def test_a_long_chain_moves_as_by_other_equations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, sizes", [(chain, (50, 200)), (cable, (25, 100)), (tower, (25, 100))])
+@pytest.mark.parametrize(
+    "build, sizes", [(chain, (50, 200)), (cable, (25, 100)), (tower, (25, 100)), (strip, (25, 100))]
+)
 def test_no_dense_matrix_and_programs_of_one_size(build, sizes):
     lines = []
     for n in sizes:
@@ -204,12 +215,17 @@ def test_events_and_dense_output():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build, t1", [(lambda n: chain(n, curl=0.2), 0.2), (cable, 0.05)])
-def test_derivatives_three_ways(build, t1):
+@pytest.mark.parametrize(
+    "build, t1, names",
+    [
+        (lambda n: chain(n, curl=0.2), 0.2, ("rod1.mass", "spring2.stiffness", "spring2.damping")),
+        (cable, 0.05, ("rod1.mass", "bend2.stiffness", "bend2.damping")),
+        (strip, 0.05, ("strip_node1.mass", "strip2.section.thickness", "strip2.damping_time")),
+    ],
+)
+def test_derivatives_three_ways(build, t1, names):
     system = build(3)
     state = mb.assemble(system)
-    force = system.catalogue.force_names()[-1]
-    names = ["rod1.mass", f"{force}.stiffness", f"{force}.damping"]
     values = [mb.parameters(system)[name] for name in names]
     weights = jnp.asarray(np.random.default_rng(0).normal(size=system.nq + system.nu))
 
@@ -239,6 +255,8 @@ def test_size_decides():
         (chain(16), Projection, Projection),
         (tower(2), Unconstrained, Unconstrained),
         (tower(8), Projection, Unconstrained),
+        (strip(8), Partition, Partition),
+        (strip(10), Projection, Partition),
     ):
         assert isinstance(default_manifold(system, hermite, None), implicit)
         assert isinstance(default_manifold(system, adams, None), explicit)
