@@ -223,8 +223,9 @@ def from_matrix(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
 def half_turn(p: Float[Array, "4"]) -> Float[Array, "4"]:
     """Unit Euler parameters of half the shortest turn, smooth below half a turn."""
     xp = namespace(p)
-    near = xp.where(p[0] < 0, -p, p)
-    return normalize(near + norm(p) * np.eye(4, dtype=p.dtype)[0])
+    near, length = xp.where(p[0] < 0, -p, p), norm(p)
+    # The length of the numerator, by its square.
+    return (near + length * np.eye(4, dtype=p.dtype)[0]) / xp.sqrt(2.0 * length * (length + near[0]))
 
 
 def rotation_vector(p: Float[Array, "4"]) -> Float[Array, "3"]:
@@ -232,7 +233,11 @@ def rotation_vector(p: Float[Array, "4"]) -> Float[Array, "3"]:
 
     It is smooth below half a turn, where it changes its sign. Derivatives of any order are also correct at zero.
     """
-    half = half_turn(p)
+    return doubled(half_turn(p))
+
+
+def doubled(half: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The rotation vector [rad] of twice a turn, below a quarter turn."""
     tangent = half[1:] / half[0]
     return 4.0 * _arc_tangent_ratio(dot(tangent, tangent)) * tangent
 

@@ -90,7 +90,8 @@ class AbstractBeam(AbstractPointPair):
         turn = rot.multiply(rot.conjugate(self.orientation_a), relative_orientation(poses))
         turn = rot.multiply(turn, self.orientation_b)
         in_a = rot.unrotate(self.orientation_a, offset_in_a(space, self, poses))
-        return rot.unrotate(rot.half_turn(turn), in_a) / self.length, rot.rotation_vector(turn) / self.length
+        half = rot.half_turn(turn)
+        return rot.unrotate(half, in_a) / self.length, rot.doubled(half) / self.length
 
     def path(self, space, poses):
         # The cubic curve along the sections' x axes.

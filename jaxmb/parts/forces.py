@@ -42,9 +42,9 @@ def generalized_force(space, part, coordinates, poses, velocities, law):
     `coordinates(part, poses)` has shape (n,), `law(value, rate)` returns the n conjugate forces; the wrench on body k
     is `N_kᵀ (∂coordinates/∂pose_k)ᵀ force`.
     """
-    value, rate = rate_of(space, part, coordinates, poses, velocities)
-    _, pull = jax.vjp(lambda x: coordinates(part, x), poses)
-    (gradient,) = pull(law(value, rate))
+    value, push = jax.linearize(lambda x: coordinates(part, x), poses)
+    rate = with_drift(part, push(jax.vmap(space.rates)(poses, velocities)), lambda part: coordinates(part, poses))
+    (gradient,) = jax.linear_transpose(push, poses)(law(value, rate))
     return jax.vmap(space.pull_back)(poses, gradient)
 
 

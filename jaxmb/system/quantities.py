@@ -64,6 +64,8 @@ class Quantities(Mapping[str, Quantity]):
         self._system, self._measures = system, measures
 
     def __getitem__(self, name: str) -> Quantity:
+        if not isinstance(name, str):
+            raise TypeError(f"A quantity has a name, a string; got {name!r}. Give several names one after the other.")
         shape, view, place, *kind = self._measures[name]
         return Quantity(shape, functools.partial(view, self._system, place), *kind)
 

@@ -26,7 +26,7 @@ FAULTS = [
         "(self._clipped_control() - self.activation) * self.lag",
     ),
     Fault("parts/beam.py", "rot.rotate_2d(-start - turn / 2,", "rot.rotate_2d(-start - turn,"),
-    Fault("parts/beam.py", "rot.unrotate(rot.half_turn(turn), in_a)", "rot.unrotate(turn, in_a)"),
+    Fault("parts/beam.py", "rot.unrotate(half, in_a)", "rot.unrotate(turn, in_a)"),
     Fault("parts/beam.py", "(strain + self.damping_time * rate)", "(strain - self.damping_time * rate)"),
     Fault("parts/beam.py", "-self.length * law(x, v)", "-law(x, v)"),
     Fault("parts/beam.py", "return -self.length * self.deformations", "return self.length * self.deformations"),
@@ -835,7 +835,7 @@ FAULTS = [
     ),
     Fault("linalg/rotations.py", "return 4.0 * pull_back(p, pdot)", "return 2.0 * pull_back(p, pdot)"),
     Fault("linalg/rotations.py", "total * near + term", "total * near"),
-    Fault("linalg/rotations.py", "near = xp.where(p[0] < 0, -p, p)", "near = p"),
+    Fault("linalg/rotations.py", "near, length = xp.where(p[0] < 0, -p, p)", "near, length = p"),
     # Batches in lanes
     Fault(
         "lanes/control.py",

@@ -55,6 +55,8 @@ def test_what_is_no_table_is_refused(monkeypatch):
     motion = turning()
     with pytest.raises(ValueError, match=r"Unknown quantity 'bar\.angel'.*bar\.angle"):
         motion.to_pandas(["bar.angel"])
+    with pytest.raises(TypeError, match=r"got \['bar\.angle'\]\. Give several names one after the other"):
+        motion.plot(["bar.angle"])
     batch = motion_of(motion.system, np.tile(TS, (2, 1)), np.zeros((2, 5, 3)), np.zeros((2, 5, 3)))
     with pytest.raises(ValueError, match=r"a batch of shape \(2,\); choose a member"):
         batch.to_pandas()
