@@ -25,7 +25,11 @@ def add_to(commands: Any) -> None:
         help="such as simulate, planar.Revolute, Trajectory.reactions, four_bar; a module: planar, solvers; or a "
         "topic: tolerances, derivatives, contacts",
     )
-    command.add_argument("--all", action="store_true", help="also the methods of parts, for user-defined parts")
+    command.add_argument(
+        "--all",
+        action="store_true",
+        help="also the methods of parts, for user-defined parts; without a name, what each name is",
+    )
     command.set_defaults(command=_help)
 
 
@@ -42,4 +46,4 @@ def _help(arguments: argparse.Namespace) -> None:
     if arguments.names:
         print("\n\n".join(map(shown, arguments.names)))
     else:
-        print(reference.listed(width, styled))
+        print(reference.listed(width, styled, arguments.all))

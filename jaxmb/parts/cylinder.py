@@ -57,7 +57,8 @@ class Cylinder(AbstractCylinder, AbstractTendon):
 
     It stands among the joints of a scene, and has the coordinate `length`. Other parts act on `"lift.length"`:
     `JointStop` or `Stop` ends the stroke, `JointFriction` rubs as the seals do, `JointForce` or `Motor` pushes with
-    a force. A `JointDriver` prescribes the length; `needed_pressure` is the pressure for its force:
+    a force. `required_forces` with `by=["lift.pressure"]` finds the pressure along a motion. A `JointDriver` prescribes
+    the length; `needed_pressure` is the pressure for its force:
 
     ```python
     ram = {"bore_area": 2e-3, "point_a": (0.0, -1.0)}

@@ -11,8 +11,9 @@ from .topics import Topic, topics
 _HOW = (
     "`jaxmb help NAME` explains a name, such as `jaxmb help simulate`, all names of a module, such as `jaxmb help "
     "planar`, or a topic, such as `jaxmb help tolerances`. Examples go on from the script of `jaxmb help "
-    "getting-started`. All topics and public names:"
+    "getting-started`. "
 )
+_SHORT, _ALL = "Topics, and public names, which `jaxmb help --all` describes:", "All topics and public names:"
 _BOLD, _CODE, _PLAIN = "\x1b[1m", "\x1b[36m", "\x1b[0m"
 _ITEM = re.compile(r" *(- |\d+\. )")
 _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\.(?:md|ipynb)\)")
@@ -44,14 +45,17 @@ def shown_topic(topic: Topic, width: int = 80, styled: bool = False) -> str:
     return "\n\n".join(_styled(part, styled) for part in parts)
 
 
-def listed(width: int = 80, styled: bool = False) -> str:
-    """A hint, all topics, and all public names by subject, each with its first sentence."""
+def listed(width: int = 80, styled: bool = False, every: bool = False) -> str:
+    """A hint, all topics, and the public names by subject; with `every` each with its first sentence."""
     pages = _rows(((name, topic.summary) for name, topic in topics().items()), width)
-    parts = [_hanging(_HOW, 0, 0, width), "**Topics**", pages]
+    parts = [_hanging(_HOW + (_ALL if every else _SHORT), 0, 0, width), "**Topics**", pages]
     for subject in subjects():
         # Some modules have only names of other modules.
-        if subject.entries:
+        if subject.entries and every:
             parts += [f"**{subject.title}**", _table(subject.entries, width)]
+        elif subject.entries:
+            names = ", ".join(entry.short for entry in subject.entries)
+            parts.append(f"**{subject.title}**\n{_hanging(names, 2, 2, width)}")
     return "\n\n".join(_styled(part, styled) for part in parts)
 
 

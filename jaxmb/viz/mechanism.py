@@ -32,6 +32,8 @@ _TIMES = 6
 _THIN = 0.2
 _EDGE: Color = (40, 40, 40)
 # Of a figure in space, in inches: the margin, the height of a title, and the largest height of the axes.
+# Between the ticks of the vertical axis and their numbers [points].
+_CLEAR = 6.0
 _PAD, _TITLE, _HIGHEST = 0.12, 0.35, 6.0
 
 
@@ -121,6 +123,8 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
     else:
         axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
         axes.set(zlabel="z [m]", aspect="equal")
+        # The signs of numbers stand clear of the axis.
+        axes.tick_params(axis="z", pad=_CLEAR)
         sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
         for k, name in enumerate("xyz"):
             axes.locator_params(axis=name, nbins=max(1, round(8 * sizes[k] / sizes.max())), min_n_ticks=1)

@@ -119,7 +119,9 @@ def test_help_on_a_name(capsys):
     assert main(["help"]) == 0
     out = capsys.readouterr().out
     assert "jaxmb help planar" in out.split("\n\n")[0] and "jaxmb.studies" not in out
-    assert "Scenes and their numbers" in out and "  mechanisms.four_bar  Crank, coupler and rocker" in out
+    assert "Scenes and their numbers" in out and "four_bar" in out and "Crank, coupler and rocker" not in out
+    assert main(["help", "--all"]) == 0
+    assert "  mechanisms.four_bar  Crank, coupler and rocker" in capsys.readouterr().out
 
 
 def test_help_on_a_part_has_its_methods_with_all(capsys):

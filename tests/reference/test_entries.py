@@ -130,11 +130,13 @@ def test_shown_text_with_styles():
 
 
 def test_listed_names_are_all():
-    text = listed(width=200)
+    text, short = listed(width=200, every=True), listed(width=10_000)
     for subject in subjects():
-        assert (subject.title in text.splitlines()) == bool(subject.entries)
+        assert (subject.title in text.splitlines()) == (subject.title in short.splitlines()) == bool(subject.entries)
         for entry in subject.entries:
             assert f"\n  {entry.name}  {entry.summary[:40]}" in text
+        assert not subject.entries or f"\n  {', '.join(entry.short for entry in subject.entries)}" in short
+    assert len(listed(width=100).splitlines()) < len(text.splitlines()) / 3
 
 
 def test_shown_contents_of_a_module_and_a_class():

@@ -110,9 +110,12 @@ class RequiredForces(eqx.Module):
     def __repr__(self) -> str:
         if is_traced((self.ts, self.forces)):
             return super().__repr__()
-        largest = {name: np.max(np.abs(force), initial=0.0) for name, force in self.forces.items()}
-        sizes = ", ".join(f"{name} {x:.4g} {effort(self.machine, name)[1]}".rstrip() for name, x in largest.items())
-        return f"RequiredForces at {self.ts.size} times; largest: {sizes}"
+        rows = [f"RequiredForces at {self.ts.size} times"]
+        for name, force in self.forces.items() if self.ts.size else ():
+            least, most, power = np.min(force), np.max(force), np.max(np.abs(self.power[name]))
+            span = f"  {name}: {least:.4g} to {most:.4g} {effort(self.machine, name)[1]}".rstrip()
+            rows.append(f"{span}; power at most {power:.4g} W")
+        return "\n".join(rows)
 
 
 @names_arguments
@@ -153,9 +156,10 @@ def required_forces(
         derivatives: smooth measured positions first.
     - `by`: names of actuators. A `Driver`, `JointDriver` or `Servo` exerts its `drive_force`; its prescribed motion is
         ignored. A force on a coordinate, such as a `Motor` or `JointForce`, is replaced by the sought force. On a
-        coordinate of a joint, a body or a `LagrangianSystem`, `"pin.angle"`, `"hull.x"`, `"theta"`, a force is added. A
-        parameter that forces are proportional to, `"engine.torque"` of a `Torque`, `"push.force"` or `"servo.control"`,
-        has the sought value, also in place of an input, and beyond a `control_range` with a warning.
+        coordinate of a joint, a body or a `LagrangianSystem`, `"pin.angle"`, `"hull.x"`, `"theta"`, a force is added;
+        on `"lift.length"` of a `Cylinder`, the force of its rod. A parameter that forces are proportional to,
+        `"engine.torque"` of a `Torque`, `"push.force"`, `"lift.pressure"` or `"servo.control"`, has the sought value,
+        also in place of an input, and beyond a `control_range` with a warning.
     - `ts` [s]: ascending times, default the times of the first `Series`; not with a `Trajectory`.
     - `weights` > 0, by all names of `by`: the solution has the least sum of `weight × force²`.
     - `guess`: a state near the first position of a motion by coordinates, default that of the system; positions that
