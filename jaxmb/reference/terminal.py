@@ -5,7 +5,7 @@ import re
 import textwrap
 from collections.abc import Iterable
 
-from .entries import Entry, bases, further_fields, members, signature, subjects
+from .entries import Entry, bases, entries, further_fields, members, signature, subjects
 from .topics import Topic, topics
 
 _HOW = (
@@ -30,6 +30,9 @@ def shown(entry: Entry, width: int = 80, styled: bool = False, every: bool = Fal
     """
     parts = [_styled(_heading(entry, width), styled)]
     parts += [block if is_code else _styled(block, styled) for block, is_code in _filled(entry.text, width)]
+    alike = [x.name for x in entries().values() if x.short.lower() == entry.short.lower() and x.short != entry.short]
+    if alike:
+        parts.append(_styled(f"Another name: {', '.join(f'`jaxmb help {name}`' for name in alike)}", styled))
     if entry.is_part and not every:
         parts.append(_styled(f"Its methods, which systems call: `jaxmb help --all {entry.name}`", styled))
     elif entry.kind in ("module", "class"):

@@ -134,6 +134,11 @@ def test_help_on_a_part_has_its_methods_with_all(capsys):
     assert "From parts.AbstractPart" in capsys.readouterr().out
 
 
+def test_help_on_names_that_differ_by_capitals(capsys):
+    assert main(["help", "cylinder"]) == 0
+    assert "jaxmb help planar.Cylinder`" in capsys.readouterr().out
+
+
 def test_help_on_a_topic(capsys):
     assert main(["help", "tolerances", "planar.Revolute"]) == 0
     out = capsys.readouterr().out

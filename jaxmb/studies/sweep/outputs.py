@@ -49,7 +49,10 @@ def returned(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Ret
         steps = getattr(result, "stats", {}).get("num_steps")
         result = getattr(result, "result", result)
         if not is_enumerated(result):
-            raise ValueError(f"The output 'result' must be a trajectory or its result, got {type(result).__name__}.")
+            raise ValueError(
+                f"The output 'result' must be a trajectory or its result, got {type(result).__name__}. Leave it out: "
+                "other studies have NaN where they fail."
+            )
     values = dict(_flat("", given))
     for name in values:
         if name in RESERVED or name in parameters:
