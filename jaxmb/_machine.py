@@ -29,9 +29,8 @@ def limit_of_threads() -> int | None:
 def use_one_thread_in_lapack() -> None:
     """Let LAPACK, which XLA calls, compute with one thread, unless the environment has a number.
 
-    It has an effect before SciPy is loaded.
-    OpenBLAS shares out triangular solutions from eight columns on, and its threads wait for each other in loops: on
-    cores that other processes use, a motion takes a hundred times as long.
+    It has an effect before SciPy is loaded. OpenBLAS shares out triangular solutions from eight columns on, and its
+    threads wait for each other in loops: on cores that other processes use, a motion takes a hundred times as long.
     """
     if not {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"} & os.environ.keys():
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
