@@ -143,7 +143,9 @@ def _rejoined(program: Program, found: list[Guess]) -> tuple[str, bool]:
     for phase, (part, at) in enumerate(zip(program.parts, program.intervals(), strict=True)):
         task, (states, ts, *_) = part.task, found[phase]
         system, arrivals = task.system, _arrivals(states, at)
-        if before is not None and _are_apart(*before, system, states.q[0]):
+        # Jumps between phases with the same coordinates are told by the coordinate.
+        same = before is not None and before[0].coordinate_names() == system.coordinate_names()
+        if before is not None and not same and _are_apart(*before, system, states.q[0]):
             jumps.append(ts[0])
         for k in range(1, task.intervals + 1):
             if distance(system, arrivals[k - 1, : system.nq], states.q[k]) > APART:
