@@ -201,6 +201,8 @@ def _draw_ground(axes, ground):
     line = ground.position + profile @ rotation_matrix(ground.orientation).T
     bottom = min(axes.get_ylim()[0], float(line[:, 1].min()) - 0.02 * (high - low))
     axes.fill_between(line[:, 0], line[:, 1], bottom, color=faded(GROUND_COLOR, 1.0), linewidth=0, zorder=1)
+    # Its edge is visible on wheels that hide a bump.
+    axes.plot(*line[:, :2].T, color=faded(_EDGE, 1.0), linewidth=1.0, zorder=3)
     axes.set(xlim=(low, high), ylim=(bottom, axes.get_ylim()[1]))
 
 
