@@ -1,6 +1,6 @@
 """A mechanism drawn at several times of its motion."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,13 +10,14 @@ from .._arguments import whole_number
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
-from ..parts.shapes import GROUND as GROUND_COLOR, Color
+from ..parts.shapes import GROUND as GROUND_COLOR, AbstractShape, Color
 from ..studies.inverse import RequiredForces
 from ..system import AbstractSystem
 from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
 from .figure import color as color_of, new_figure
 from .meshes import heights
+from .motion_nodes import check_shapes
 from .one_motion import check_finite, one_motion, poses_of
 from .silhouettes import area, edges, size, strip, stroke
 from .solids import Placed, color_in, solids
@@ -41,6 +42,7 @@ def plot_mechanism(
     trajectory: Trajectory | RequiredForces | State,
     frames: int = 5,
     *,
+    shapes: Mapping[str, AbstractShape | Sequence[AbstractShape]] | None = None,
     system: AbstractSystem | None = None,
     deformation: float = 1.0,
 ) -> "Figure":
@@ -57,15 +59,17 @@ def plot_mechanism(
     the terrain. Up to 8 bodies have paths and a legend.
 
     **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State`, with its `system`; `frames`: the
-    number of poses, at least 1; `deformation`: the factor by which deformations of elastic bars and bodies are
-    magnified, from the chord of a bar that a joint holds at another point than its origin.
+    number of poses, at least 1; `shapes` as in `show`; `deformation`: the factor by which deformations of elastic bars
+    and bodies are magnified, from the chord of a bar that a joint holds at another point than its origin.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
 
-    **Raises:** `ValueError` for `frames < 1`, a batch, states that are not finite, and a system without bodies;
-    `ImportError` without matplotlib.
+    **Raises:** `ValueError` for `frames < 1`, unknown bodies, a batch, states that are not finite, and a system without
+    bodies; `ImportError` without matplotlib.
     """
+    # A state has no time.
+    timed = not isinstance(trajectory, State)
     frames, trajectory = whole_number("frames", frames), poses_of(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(
@@ -74,19 +78,21 @@ def plot_mechanism(
         )
     trajectory = one_motion(trajectory, "plot_mechanism", 1)
     check_finite(trajectory)
+    check_shapes(trajectory.system, shapes or {})
     picture = picture_of(trajectory, deformation)
-    shapes = solids(picture, {}, None)
+    placed = solids(picture, shapes or {}, None)
     times = trajectory.ts.shape[0]
     shown = np.unique(np.linspace(0, times - 1, min(frames, times)).round().astype(int))
-    figure, axes = drawn(picture, shapes, shown.tolist())
+    figure, axes = drawn(picture, placed, shown.tolist())
     if len(picture.bodies) <= _FEW:
         for k, name in enumerate(picture.bodies):
             path, color = picture.positions[name][:, : 2 if picture.planar else 3], color_of(k)
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")
-    title = "t = " + ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown) + " s" if len(shown) <= _TIMES else ""
-    finish(figure, axes, picture, shapes, "  ·  ".join(filter(None, [title, *picture.notes])))
+    instants = ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown)
+    title = f"t = {instants} s" if timed and len(shown) <= _TIMES else ""
+    finish(figure, axes, picture, placed, "  ·  ".join(filter(None, [title, *picture.notes])))
     return figure
 
 

@@ -96,6 +96,7 @@ def test_figures_leave_out_times_that_a_run_did_not_reach(piston):
     assert chosen(early, 10).ts.size == 5
     last = dataclasses.replace(piston, ts=piston.ts[-1:], ys=jax.tree.map(lambda y: y[-1:], piston.ys))
     own, other = viz.plot_mechanism(piston.end, system=piston.system).axes[0], viz.plot_mechanism(last).axes[0]
+    assert (own.get_title(), other.get_title()) == ("", "t = 1 s")
     for line, same in zip(own.lines, other.lines, strict=True):
         assert line.get_label() == same.get_label()
         np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
@@ -238,7 +239,7 @@ def test_plot_mechanism_of_the_plane_shows_shapes_of_parts():
     discs = [patch.get_xy() for patch in axes.patches if np.allclose(np.ptp(patch.get_xy(), axis=0), 0.2, atol=2e-3)]
     centres = [0.5 * (disc.min(axis=0) + disc.max(axis=0)) for disc in discs]
     np.testing.assert_allclose(centres, [(0.0, 0.4), (1.0, 0.4)], atol=2e-3)
-    *springs, path, end = axes.lines
+    *springs, path, end, edge = axes.lines
     np.testing.assert_allclose(np.column_stack(path.get_data()), q[:, :2])
     assert end.get_label() == "ball"
     for line, x in zip(springs, (0.0, 1.0), strict=True):
@@ -246,6 +247,25 @@ def test_plot_mechanism_of_the_plane_shows_shapes_of_parts():
         np.testing.assert_allclose(points[[0, -1]], [(0.0, 1.0), (x, 0.4)], atol=1e-12)
     (ground,) = axes.collections
     assert np.max(ground.get_paths()[0].vertices[:, 1]) == pytest.approx(0.3, abs=0.05)
+    # The edge of the ground hides behind no body.
+    assert np.max(edge.get_ydata()) == pytest.approx(0.3, abs=0.05)
+    assert edge.zorder > max(patch.zorder for patch in axes.patches)
+
+
+@pytest.mark.parametrize("space", [planar, spatial])
+def test_plot_mechanism_draws_given_shapes(space):
+    size = 0.1 if space is planar else (0.1, 0.1, 0.1)
+    system = mb.Scene([space.Body("ball", mass=1.0, inertia=size)]).compile()
+    rest = mb.assemble(system)
+    given = {"ball": shapes.Sphere(0.3), "ground": shapes.Cylinder(2.0, 0.1)}
+    axes = viz.plot_mechanism(rest, system=system, shapes=given).axes[0]
+    if space is planar:
+        widths = [np.ptp(patch.get_xy()[:, 0]) for patch in axes.patches]
+    else:
+        widths = [np.ptp(line.get_data_3d()[0]) for line in axes.lines if len(line.get_data_3d()[0]) > 1]
+    np.testing.assert_allclose(sorted({round(float(width), 2) for width in widths} - {0.0}), [0.6, 4.0])
+    with pytest.raises(ValueError, match="Unknown body 'bal'; did you mean 'ball'"):
+        viz.plot_mechanism(rest, system=system, shapes={"bal": shapes.Sphere(0.3)})
 
 
 def test_disc_contact_is_drawn_as_wheels():
