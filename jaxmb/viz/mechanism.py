@@ -39,7 +39,7 @@ _PAD, _TITLE, _HIGHEST = 0.12, 0.35, 6.0
 
 
 def plot_mechanism(
-    trajectory: Trajectory | RequiredForces | State,
+    trajectory: Trajectory | RequiredForces | State | list[State],
     frames: int = 5,
     *,
     shapes: Mapping[str, AbstractShape | Sequence[AbstractShape]] | None = None,
@@ -47,20 +47,21 @@ def plot_mechanism(
     deformation: float = 1.0,
 ) -> "Figure":
     """Draw the bodies at evenly spaced saved times, fainter at earlier times, with the paths of their mass centres; or
-    at one state.
+    at states.
 
     ```python
     jaxmb.viz.plot_mechanism(motion, frames=4).savefig("poses.png")
-    jaxmb.viz.plot_mechanism(state, system=system)
+    jaxmb.viz.plot_mechanism([state, motion.end], system=system)
     ```
 
     Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
     mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
     the terrain. Up to 8 bodies have paths and a legend.
 
-    **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State`, with its `system`; `frames`: the
-    number of poses, at least 1; `shapes` as in `show`; `deformation`: the factor by which deformations of elastic bars
-    and bodies are magnified, from the chord of a bar that a joint holds at another point than its origin.
+    **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State` or a list of states, with their
+    `system`; `frames`: the number of poses, at least 1; `shapes` as in `show`; `deformation`: the factor by which
+    deformations of elastic bars and bodies are magnified, from the chord of a bar that a joint holds at another point
+    than its origin.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
@@ -69,7 +70,7 @@ def plot_mechanism(
     bodies; `ImportError` without matplotlib.
     """
     # A state has no time.
-    timed = not isinstance(trajectory, State)
+    timed = not isinstance(trajectory, State | list)
     frames, trajectory = whole_number("frames", frames), poses_of(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(

@@ -37,6 +37,16 @@ def poses_of(shown: Any, system: AbstractSystem | None) -> Trajectory:
 
 
 @poses_of.register
+def _(shown: list, system):
+    for state in shown or [None]:
+        check_kind("plot_mechanism: each of a list", state, State, "a state", "motions have pictures of their own")
+    # Turns of joints, which some states count, are not seen.
+    each = [as_motion(State(state.q, state.u, state.z), system) for state in shown]
+    joined = lambda *leaves: np.concatenate(leaves)
+    return changed(each[0], ts=joined(*(x.ts for x in each)), ys=jax.tree.map(joined, *(x.ys for x in each)))
+
+
+@poses_of.register
 def _(shown: RequiredForces, system):
     return changed(still(shown.machine, shown.ys), ts=shown.ts, ys=shown.ys)
 

@@ -100,6 +100,10 @@ def test_figures_leave_out_times_that_a_run_did_not_reach(piston):
     for line, same in zip(own.lines, other.lines, strict=True):
         assert line.get_label() == same.get_label()
         np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
+    start = jax.tree.map(lambda y: y[0], piston.ys)
+    both = viz.plot_mechanism([start, piston.end], system=piston.system).axes[0]
+    assert both.get_title() == "" and len(both.patches) == len(own.patches) + 1  # The ground is drawn once.
+    np.testing.assert_array_equal(both.patches[-1].get_xy(), own.patches[-1].get_xy())
 
 
 def test_figures_of_what_they_cannot_show_are_refused(piston):
@@ -126,6 +130,7 @@ def test_figures_of_what_they_cannot_show_are_refused(piston):
         (viz.plot_motion, piston, {"names": ["slid"]}, "Unknown body, joint or quantity 'slid'; did you mean 'slide'"),
         (viz.plot_motion, state, {}, "plot_motion shows a motion, got a State"),
         (viz.plot_mechanism, state, {}, "needs its system: give system=system"),
+        (viz.plot_mechanism, [state, piston], {"system": piston.system}, "each of a list must be a state"),
         (viz.plot_mechanism, piston, {"system": piston.system}, "a motion has its own system"),
         (
             viz.plot_mechanism,
