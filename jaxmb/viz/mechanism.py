@@ -88,6 +88,9 @@ def plot_mechanism(
     if len(picture.bodies) <= _FEW:
         for k, name in enumerate(picture.bodies):
             path, color = picture.positions[name][:, : 2 if picture.planar else 3], color_of(k)
+            if shapes and name in shapes:
+                # Given shapes may have colours.
+                color = next((faded(shape.color, 1.0) for body, shape in placed if body == name), color)
             axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")

@@ -262,8 +262,9 @@ def test_plot_mechanism_draws_given_shapes(space):
     size = 0.1 if space is planar else (0.1, 0.1, 0.1)
     system = mb.Scene([space.Body("ball", mass=1.0, inertia=size)]).compile()
     rest = mb.assemble(system)
-    given = {"ball": shapes.Sphere(0.3), "ground": shapes.Cylinder(2.0, 0.1)}
+    given = {"ball": shapes.Sphere(0.3, color=(255, 0, 0)), "ground": shapes.Cylinder(2.0, 0.1)}
     axes = viz.plot_mechanism(rest, system=system, shapes=given).axes[0]
+    assert [line.get_color() for line in axes.lines if line.get_label() == "ball"] == [(1.0, 0.0, 0.0)]
     if space is planar:
         widths = [np.ptp(patch.get_xy()[:, 0]) for patch in axes.patches]
     else:
