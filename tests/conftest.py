@@ -15,8 +15,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # The programs that the short tests of a file may compile, eager operations too, unless it states its `MOST_PROGRAMS`.
 MOST_PROGRAMS = 60
-# Where Linux lists the memory maps of this process, and with how many of them compiled programs are given back.
-MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
+# Where Linux lists the memory maps of this process, and with how many of them traced and compiled programs are given
+# back: a process may have 65530. Until then files share them, which saves a sixth of the processor seconds.
+MAPS, MOST_MAPS = Path("/proc/self/maps"), 10_000
 
 
 def pytest_addoption(parser):
@@ -54,7 +55,7 @@ def pytest_configure(config):
         compile_for_tests()
     programs = config.cache.mkdir("programs")
     # Tracing makes and drops many objects, few of them in cycles: to collect as often as usual takes a tenth of it.
-    gc.set_threshold(100_000, 20, 20)
+    gc.set_threshold(200_000, 50, 50)
     settings = {
         "jax_compilation_cache_dir": str(programs),
         "jax_persistent_cache_min_compile_time_secs": 1.0,
@@ -87,21 +88,10 @@ _compiled = collections.Counter()
 jax.monitoring.register_event_duration_secs_listener(_note_compilation)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _forget_programs():
-    """Give back the memory maps of a module's compiled programs: a process may have 65530 of them and no more."""
-    yield
-    _clear_caches()
-
-
 @pytest.fixture(autouse=True)
-def _forget_many_programs():
-    """The same within a module whose programs have many of them."""
+def _forget_programs():
+    """Give back the memory maps of compiled programs."""
     yield
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
-        _clear_caches()
-
-
-def _clear_caches():
-    eqx.clear_caches()
-    jax.clear_caches()
+        eqx.clear_caches()
+        jax.clear_caches()

@@ -302,7 +302,10 @@ class JointSpring(AbstractCoordinateForce, AbstractPotentialForce):
         return self.near(value, self.middle) - self.free.reshape(-1)
 
     def middle_of_turn(self):
-        return self.free if self.middle is None else self.middle
+        middle, stiffness = self.free if self.middle is None else self.middle, jnp.asarray(self.stiffness)
+        # A damper alone does not jump.
+        acts = jnp.reshape(stiffness != 0, stiffness.shape + (1,) * (jnp.ndim(middle) - stiffness.ndim))
+        return jnp.where(acts, middle, jnp.nan)
 
     def law(self, x, v):
         return -self.stiffness * self._stretch(x) - self.damping * v

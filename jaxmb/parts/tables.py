@@ -25,7 +25,8 @@ class TableSpring(AbstractCoordinateForce, AbstractScalarPart, AbstractPotential
     The curve has two continuous derivatives. Where the points rise it never falls, and where they fall it never rises;
     next to a highest or a lowest point it may pass that point. Beyond the first and the last point it continues as a
     straight line, through this point and its neighbour. The energy is its integral from the first point. In space an
-    angle counts within half a turn of the middle of the table. `spring.curve(1.05)` is the force without a machine.
+    angle counts within half a turn of the middle of the table. `spring.curve(1.05)` is the generalized force −f(1.05),
+    without a machine.
 
     **Arguments:** `values` [rad, m] of the coordinate, shape (n,), ascending, n ≥ 3; `forces` [N m, N], shape (n,),
     positive where the spring pulls towards smaller values.

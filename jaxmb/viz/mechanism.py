@@ -59,9 +59,9 @@ def plot_mechanism(
     the terrain. Up to 8 bodies have paths and a legend.
 
     **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State` or a list of states, with their
-    `system`; `frames`: the number of poses, at least 1; `shapes` as in `show`; `deformation`: the factor by which
-    deformations of elastic bars and bodies are magnified, from the chord of a bar that a joint holds at another point
-    than its origin.
+    `system`; `frames`: the number of poses of a motion, at least 1; `shapes` as in `show`; `deformation`: the factor by
+    which deformations of elastic bars and bodies are magnified, from the chord of a bar that a joint holds at another
+    point than its origin.
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows. Times that a run did not reach are
     left out.
@@ -71,7 +71,8 @@ def plot_mechanism(
     """
     # A state has no time.
     timed = not isinstance(trajectory, State | list)
-    frames, trajectory = whole_number("frames", frames), poses_of(trajectory, system)
+    frames = len(trajectory) if isinstance(trajectory, list) else whole_number("frames", frames)
+    trajectory = poses_of(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(
             f"plot_mechanism draws bodies, and a {type(trajectory.system).__name__} has none; plot_motion shows its "

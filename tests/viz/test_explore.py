@@ -49,6 +49,7 @@ def test_motion_is_that_of_the_same_numbers(linkage):
     assert [slider.unit for slider in variation.sliders] == ["kg", "m", "rad/s", "rad"]
 
 
+@pytest.mark.slow
 def test_motion_with_an_input_is_that_of_a_constant(driven):
     variation = of(driven, {"motor.force": (0.0, 9.0)}, options=OPTIONS)
     assert variation.sliders[0].start == 1.0 and variation.sliders[1].name == "pin.angle"

@@ -48,6 +48,7 @@ def bounded_effort():
     return integrate.simpson(force(slope) ** 2, x=ts)
 
 
+@pytest.mark.slow
 def test_bounds_of_cubic_controls_hold_between_nodes(system):
     plan = moved(system, PUSHED, interpolation="cubic", intervals=8)
     force = jax.vmap(plan.controls["push.force"])(jnp.linspace(0.0, 1.0, 2001))
@@ -56,6 +57,7 @@ def test_bounds_of_cubic_controls_hold_between_nodes(system):
     assert 0 < plan.objective / bounded_effort() - 1 < 2e-3
 
 
+@pytest.mark.slow
 def test_sensitivities_at_active_bounds_are_differences_of_optima(system):
     plan, aside = moved(system, PUSHED, intervals=7), 1e-3
     found = plan.sensitivities("slider.mass")["slider.mass"]
@@ -69,8 +71,10 @@ def test_sensitivities_at_active_bounds_are_differences_of_optima(system):
     np.testing.assert_allclose(found.controls["push.force"], slopes, rtol=0, atol=2e-3)
 
 
-def test_exact_second_derivatives_of_an_interval_are_differences_of_first_derivatives(monkeypatch):
-    """Of two and of three steps, with a swinging load and a running cost."""
+@pytest.mark.slow("two")
+@pytest.mark.parametrize("steps", [pytest.param(2, id="two"), pytest.param(3, id="three")])
+def test_exact_second_derivatives_of_an_interval_are_differences_of_first_derivatives(monkeypatch, steps):
+    """With a swinging load and a running cost."""
     load = planar.Body("load", mass=1.0, inertia=0.1, position=(0.3, -0.4))
     hook = planar.Revolute("hook", "slider", "load", point=(0.0, 0.0))
     slider = planar.Body("slider", mass=1.0, inertia=1.0)
@@ -85,17 +89,17 @@ def test_exact_second_derivatives_of_an_interval_are_differences_of_first_deriva
     block, random = made.problem.terms[0].block, np.random.default_rng(0)
     inputs = made.problem.terms[0].at(made.start)
     inputs += 0.1 * random.standard_normal(inputs.shape)
-    for block.steps in (2, 3):
-        outputs, first = block.linearised(inputs)
-        weights = random.standard_normal(outputs.shape)
-        scales = np.ones(inputs.shape)
-        differences = block.curvature(inputs, first, weights, scales, central=True)
-        with monkeypatch.context() as patch:
-            patch.setattr(lanes, "_MANY", 1)
-            exact = block.curvature(inputs, first, weights, scales)
-        assert np.max(np.abs(exact)) > 0.1
-        np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-7)
+    block.steps = steps
+    outputs, first = block.linearised(inputs)
+    weights = random.standard_normal(outputs.shape)
+    scales = np.ones(inputs.shape)
+    differences = block.curvature(inputs, first, weights, scales, central=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "_MANY", 1)
+        exact = block.curvature(inputs, first, weights, scales)
+    assert np.max(np.abs(exact)) > 0.1
+    np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-7)
 
 
 @pytest.mark.slow
