@@ -13,7 +13,9 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND, AbstractLink
-from ..parts.shapes import ring, wheel
+from ..parts.combinations import Tendon
+from ..parts.rope import AbstractRope
+from ..parts.shapes import DARK, Box, ring, wheel
 from ..system.picture import Anchors, Line, Picture, in_space
 from .groups import FrameGroup, Group
 
@@ -49,12 +51,17 @@ def picture(
     shapes += [
         gear for _, bodies, part in single for gear in _gears(part, bodies, parts, positions, orientations, width)
     ]
+    up = _up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity))
+    shapes += [
+        (GROUND, Box(np.where(up == 0, 4.0, 2.4) * width, position=point + 1.2 * width * up, color=DARK))
+        for _, bodies, part in single
+        for point in _held(part, bodies, space)
+    ]
     # The friction of a joint acts where the joint does.
     of_laws = {law: joint for g in system.constraints.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)
     if not system.spatial:
         moments = moments[:, None, None] * np.diag([0.5, 0.5, 1.0])
-    up = _up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity))
     return Picture(
         planar=not system.spatial,
         up=up,
@@ -90,6 +97,15 @@ def _shapes(part, space, width, followed):
     for k, shape in (*part.shapes(space, width), *along):
         frame = part.body_frames.get(str(k))
         yield k, shape if frame is None else shape.moved(*space.placement(frame.pose_in_body(space)))
+
+
+def _held(part, bodies, space):
+    """The ends of a rope or a tendon on the ground, where blocks hold it."""
+    if isinstance(part, (AbstractRope, Tendon)):
+        on_circles = part.senses if isinstance(part, AbstractRope) else (0,) * len(part.owners)
+        for k in (0, -1):
+            if bodies[part.owners[k]] == GROUND and not on_circles[k]:
+                yield np.asarray(space.in_space(part.points[k]))
 
 
 def _gears(part, bodies, parts, positions, orientations, width):

@@ -31,6 +31,8 @@ _FEW = 8
 _TIMES = 6
 # The least width of a picture, relative to its height, and the other way round.
 _THIN = 0.2
+# A machine in space is in one plane if it is this thin, relative to its size.
+_FLAT = 0.1
 _EDGE: Color = (40, 40, 40)
 # Of a figure in space, in inches: the margin, the height of a title, and the largest height of the axes.
 # Between the ticks of the vertical axis and their numbers [points].
@@ -132,7 +134,7 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
         figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
         axes.set_title(title, **style)
     else:
-        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))])
+        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))], **_view(axes, picture))
         axes.set(zlabel="z [m]", aspect="equal")
         # The signs of numbers stand clear of the axis.
         axes.tick_params(axis="z", pad=_CLEAR)
@@ -142,6 +144,17 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
             # Distances of labels are relative to the other sides; a label stands beyond the numbers at thin boxes, too.
             getattr(axes, f"{name}axis").labelpad = 13.5 * sizes.max() / np.delete(sizes, k).max() - 9.5
         _fill(figure, axes, title, style)
+
+
+def _view(axes, picture):
+    """The angles [°] to look at a machine in an upright plane nearly from its front."""
+    sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
+    upright = int(np.argmax(np.abs(picture.up)))
+    level = [(upright + 1) % 3, (upright + 2) % 3]
+    thin = int(np.argmin(sizes[level]))
+    if sizes[level[thin]] > _FLAT * sizes.max():
+        return {}
+    return {"elev": 12.0, "azim": (20.0, 290.0)[thin]}
 
 
 def _fill(figure, axes, title, style):

@@ -9,7 +9,7 @@ import pytest
 from trajectories import motion_of
 
 import jaxmb as mb
-from jaxmb import planar, spatial, viz
+from jaxmb import planar, shapes, spatial, viz
 from jaxmb.linalg.rotations import rotation_matrix
 from jaxmb.trajectory import picture_of, still
 from jaxmb.viz.motion_nodes import motion
@@ -17,7 +17,7 @@ from jaxmb.viz.scenery import View
 from jaxmb.viz.silhouettes import area
 from jaxmb.viz.solids import solids
 
-MOST_PROGRAMS = 130
+MOST_PROGRAMS = 136
 SUN, PLANET, PINION = 0.02, 0.03, 0.025
 RING = SUN + 2 * PLANET
 
@@ -150,6 +150,20 @@ def test_tendon_is_a_cord_through_its_points():
     assert line.kind == "cord" and segments.shape == (2, 2, 2, 3)
     drawn = [np.column_stack(line.get_data()) for line in viz.plot_mechanism(swing, frames=1).axes[0].lines]
     assert any(np.allclose(points, line.points[0, :, :2]) for points in drawn if points.shape == (3, 2))
+
+
+def test_ropes_end_in_blocks_of_the_ground():
+    """A tendon and a rope, which also runs over a pulley of the ground; a drum of the ground needs no block."""
+    path = [("ground", (0.0, 0.5)), mb.Pulley("ground", 0.1, "right", centre=(0.0, 1.0)), ("bob", (0.0, 0.0))]
+    drum = [mb.Pulley("ground", 0.1, "right", centre=(0.0, 1.0)), ("bob", (0.0, 0.0))]
+    ends = {"tendon": mb.Tendon("cord", [path[0], path[2]]), "rope": mb.Rope("rope", path), "drum": mb.Rope("r", drum)}
+    for name, part in ends.items():
+        picture = picture_of(bob(part, [(1.0, 0.0)]))
+        places = [
+            shape.position for body, shape in picture.shapes if isinstance(shape, shapes.Box) and body == "ground"
+        ]
+        blocks = [place for place in places if np.allclose(place, [0.0, 0.5 + 1.2 * picture.width, 0.0])]
+        assert len(blocks) == (name != "drum")
 
 
 def test_body_with_one_joint_reaches_to_its_frames():
