@@ -134,7 +134,7 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
         figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
         axes.set_title(title, **style)
     else:
-        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))], **_view(axes, picture))
+        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))], **front_view(axes, picture.up))
         axes.set(zlabel="z [m]", aspect="equal")
         # The signs of numbers stand clear of the axis.
         axes.tick_params(axis="z", pad=_CLEAR)
@@ -146,10 +146,10 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
         _fill(figure, axes, title, style)
 
 
-def _view(axes, picture):
-    """The angles [°] to look at a machine in an upright plane nearly from its front."""
+def front_view(axes: Any, up: Float[np.ndarray, "3"]) -> dict[str, float]:
+    """The angles [°] to look at a machine in an upright plane nearly from its front; none for another machine."""
     sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
-    upright = int(np.argmax(np.abs(picture.up)))
+    upright = int(np.argmax(np.abs(up)))
     level = [(upright + 1) % 3, (upright + 2) % 3]
     thin = int(np.argmin(sizes[level]))
     if sizes[level[thin]] > _FLAT * sizes.max():

@@ -3,12 +3,14 @@
 import matplotlib.colors
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 import jaxmb as mb
 from jaxmb import planar, spatial, viz
+from jaxmb.viz.mechanism import front_view
 
-MOST_PROGRAMS = 75
+MOST_PROGRAMS = 70
 
 
 def bar(name, length, position, angle):
@@ -171,11 +173,10 @@ def test_a_machine_in_space_fills_its_figure(way):
     assert shown[-1].y0 > max(box.y1 for box in shown[:-1])
 
 
-@pytest.mark.parametrize(("normal", "azim"), [((1.0, 0.0, 0.0), 20.0), ((0.0, 1.0, 0.0), 290.0), (None, -60.0)])
-def test_a_machine_in_an_upright_plane_is_seen_from_its_front(normal, azim):
-    """A bar across x or y; another one is seen from a corner."""
-    inside = np.array([0.0, 1.0, 1.0] if normal == (1.0, 0.0, 0.0) else [1.0, 0.0, 1.0] if normal else [1.0, 1.0, 1.0])
-    bodies = [spatial.Body("bar", mass=1.0, inertia=np.ones(3), position=inside)]
-    joints = [spatial.Revolute("pin", "ground", "bar", point=np.zeros(3), axis=normal or (0.0, 1.0, 0.0))]
-    scene = mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81))])
-    assert viz.plot_scene(scene).axes[0].azim == azim
+@pytest.mark.parametrize(
+    "sizes, view", [((0.1, 2, 1), 20.0), ((2, 0.1, 1), 290.0), ((2, 1, 0.1), None), ((2, 1, 1), None)]
+)
+def test_a_machine_in_an_upright_plane_is_seen_from_its_front(sizes, view):
+    limits = dict(zip(("xlim", "ylim", "zlim"), ((0.0, float(size)) for size in sizes), strict=True))
+    axes = Figure().add_subplot(projection="3d", **limits)
+    assert front_view(axes, np.array([0.0, 0.0, 1.0])).get("azim") == view
