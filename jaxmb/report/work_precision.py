@@ -150,7 +150,7 @@ def _plot(table: Table, title: str, accuracy: float) -> "Figure":
             if points:
                 axes.loglog(*zip(*points, strict=True), "osD^v<>"[k % 7] + "-", color=f"C{k % 10}", label=solver)
         if accuracy > 0:
-            axes.axhline(accuracy, color="0.5", linestyle=":", label="accuracy of the reference")
+            axes.axhline(accuracy, color="0.5", linestyle=":", label=f"{MARGIN:g} times the error of the reference")
         axes.set_xlabel(label)
         axes.xaxis.set_major_locator(FixedLocator(_ticks(*axes.get_xlim())))
         axes.xaxis.set_minor_locator(NullLocator())

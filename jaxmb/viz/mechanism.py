@@ -10,7 +10,7 @@ from .._arguments import whole_number
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND
-from ..parts.shapes import GROUND as GROUND_COLOR, AbstractShape, Color
+from ..parts.shapes import DARK, GROUND as GROUND_COLOR, AbstractShape, Color
 from ..studies.inverse import RequiredForces
 from ..system import AbstractSystem
 from ..system.picture import Picture
@@ -19,7 +19,7 @@ from .figure import color as color_of, new_figure
 from .meshes import heights
 from .motion_nodes import check_shapes
 from .one_motion import check_finite, one_motion, poses_of
-from .silhouettes import area, edges, size, strip, stroke
+from .silhouettes import area, faces, size, strip, stroke
 from .solids import Placed, color_in, solids
 
 if TYPE_CHECKING:
@@ -34,9 +34,11 @@ _THIN = 0.2
 # A machine in space is in one plane if it is this thin, relative to its size.
 _FLAT = 0.1
 _EDGE: Color = (40, 40, 40)
+# In space: the direction of the light, the brightness of faces along it, and the opacity of joints and of the ground.
+_LIGHT, _DIM, _CLEAR = np.array([0.4, -0.7, 0.6]), 0.65, 0.25
+# Between the vertical axis of space and its numbers [points].
+_OFF = 14.0
 # Of a figure in space, in inches: the margin, the height of a title, and the largest height of the axes.
-# Between the ticks of the vertical axis and their numbers [points].
-_CLEAR = 6.0
 _PAD, _TITLE, _HIGHEST = 0.12, 0.35, 6.0
 
 
@@ -58,7 +60,7 @@ def plot_mechanism(
 
     Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
     mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
-    the terrain. Up to 8 bodies have paths and a legend.
+    the terrain. Up to 8 bodies have paths, along a motion, and a legend.
 
     **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State` or a list of states, with their
     `system`; `frames`: the number of poses of a motion, at least 1; `shapes` as in `show`; `deformation`: the factor by
@@ -72,8 +74,9 @@ def plot_mechanism(
     bodies; `ImportError` without matplotlib.
     """
     # A state has no time.
+    several = isinstance(trajectory, list)
     timed = not isinstance(trajectory, State | list)
-    frames = len(trajectory) if isinstance(trajectory, list) else whole_number("frames", frames)
+    frames = len(trajectory) if several else whole_number("frames", frames)
     trajectory = poses_of(trajectory, system)
     if not trajectory.system.body_names:
         raise ValueError(
@@ -94,7 +97,8 @@ def plot_mechanism(
             if shapes and name in shapes:
                 # Given shapes may have colours.
                 color = next((faded(shape.color, 1.0) for body, shape in placed if body == name), color)
-            axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
+            if not several:
+                axes.plot(*path.T, color=color, linewidth=0.8, alpha=0.6, zorder=1)
             axes.plot(*path[-1], "o", color=color, markersize=4, zorder=4, label=name)
         figure.legend(loc="outside right upper", fontsize="small")
     instants = ", ".join(f"{trajectory.ts[k]:.3g}" for k in shown)
@@ -107,14 +111,17 @@ def drawn(picture: Picture, shapes: Sequence[Placed], shown: Sequence[int]) -> t
     """A figure and its axes, with bodies, springs and tracks at the `shown` times, fainter at earlier times."""
     figure = new_figure(8.0, 6.0)
     axes: Any = figure.add_subplot(projection=None if picture.planar else "3d")
-    draw = _draw_areas if picture.planar else _draw_edges
     # Objects on the ground are drawn once.
     of_ground = [placed for placed in shapes if placed[0] == GROUND and placed[1].primitive != "ground"]
-    draw(axes, picture, of_ground, 0, 1.0)
     moving = [placed for placed in shapes if placed[0] != GROUND]
-    for order, time in enumerate(shown):
-        fade = (order + 1) / len(shown)
-        draw(axes, picture, moving, time, fade)
+    fades = [(order + 1) / len(shown) for order in range(len(shown))]
+    poses = [(of_ground, 0, 1.0), *((moving, time, fade) for time, fade in zip(shown, fades, strict=True))]
+    if picture.planar:
+        for pose in poses:
+            _draw_areas(axes, picture, *pose)
+    else:
+        _draw_faces(axes, picture, poses)
+    for time, fade in zip(shown, fades, strict=True):
         _draw_paths(axes, picture, time, fade)
     return figure, axes
 
@@ -134,15 +141,17 @@ def finish(figure: Any, axes: Any, picture: Picture, shapes: Sequence[Placed], t
         figure.set_figheight(float(np.clip(6.5 * half[1] / half[0] + 1.0, 2.2, 6.5)))
         axes.set_title(title, **style)
     else:
-        axes.view_init(vertical_axis="xyz"[int(np.argmax(np.abs(picture.up)))], **front_view(axes, picture.up))
+        upright = int(np.argmax(np.abs(picture.up)))
+        axes.view_init(vertical_axis="xyz"[upright], **front_view(axes, picture.up))
         axes.set(zlabel="z [m]", aspect="equal")
-        # The signs of numbers stand clear of the axis.
-        axes.tick_params(axis="z", pad=_CLEAR)
         sizes = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
+        # The signs of numbers stand clear of the axis. Their distances are relative to the other sides.
+        axes.tick_params(axis="xyz"[upright], pad=_OFF * sizes.max() / np.delete(sizes, upright).max() - 8.0)
         for k, name in enumerate("xyz"):
             axes.locator_params(axis=name, nbins=max(1, round(8 * sizes[k] / sizes.max())), min_n_ticks=1)
-            # Distances of labels are relative to the other sides; a label stands beyond the numbers at thin boxes, too.
-            getattr(axes, f"{name}axis").labelpad = 13.5 * sizes.max() / np.delete(sizes, k).max() - 9.5
+            # A label stands beyond the numbers at thin boxes, too.
+            far = 24.0 if k == upright else 13.5
+            getattr(axes, f"{name}axis").labelpad = far * sizes.max() / np.delete(sizes, k).max() - 9.5
         _fill(figure, axes, title, style)
 
 
@@ -200,10 +209,29 @@ def _draw_areas(axes, picture, shapes, time, fade):
         )
 
 
-def _draw_edges(axes, picture, shapes, time, fade):
-    for body, shape in shapes:
-        for line in edges(shape):
-            axes.plot(*in_world(picture, body, line, time).T, color=faded(shape.color, fade), linewidth=2)
+def _draw_faces(axes, picture, poses):
+    """All faces of all times, of which the nearer ones hide the others; blocks of joints and of the ground let them be
+    seen.
+    """
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    polygons, colors, rims = [], [], []
+    for shapes, time, fade in poses:
+        for body, shape in shapes:
+            clear = body == GROUND or shape.color == DARK
+            for several in faces(shape):
+                corners = in_world(picture, body, several.reshape(-1, 3), time).reshape(several.shape)
+                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, -1])
+                size = np.linalg.norm(normals, axis=1, keepdims=True)
+                bright = np.abs(normals @ _LIGHT) / np.where(size > 0, size, 1.0)[:, 0]
+                shades = np.array(faded(shape.color, fade)) * (_DIM + (1 - _DIM) * bright[:, None])
+                polygons += list(corners)
+                colors += [(*shade, _CLEAR if clear else 1.0) for shade in shades]
+                rim = faded(_EDGE if shape.primitive == "box" else shape.color, fade)
+                rims += [(*rim, 1.0)] * len(corners) if shape.primitive == "box" else [(*x, 1.0) for x in shades]
+    if polygons:
+        axes.add_collection3d(Poly3DCollection(polygons, facecolors=colors, edgecolors=rims, linewidths=0.4))
+        axes.auto_scale_xyz(*np.concatenate(polygons).T)
 
 
 def _draw_paths(axes, picture, time, fade):

@@ -75,7 +75,7 @@ def plot_motion(trajectory: Trajectory, names: str | Sequence[str] | None = None
     - `trajectory`: a motion saved at several times.
     - `names` of quantities to show instead, all of them, such as `"piston.position"`, `"slide.displacement"`,
         `"hip.angle_rate"`, `"A.force"`, `"energy"` and `"residuals"`. The name of a body, joint, frame or part with
-        internal states selects all quantities of its motion.
+        internal states selects all quantities of its motion. Components of a vector that are zero are left out.
 
     **Returns:** a matplotlib `Figure` with one panel for each unit, or several for more than eight curves. A body has
     the colour that it has in `plot_mechanism`; components along x, y and z are solid, dashed and dotted. Large forces
@@ -142,7 +142,9 @@ def _quantities(system, names: Iterable[str]) -> list[str]:
 
 
 def _lines(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[_Line]]:
-    """The components of quantities by unit, or by word where there is none, in the order of their panels."""
+    """The components of quantities that are not zero by unit, or by word where there is none, in the order of their
+    panels.
+    """
     out: dict[str, list[_Line]] = {}
     for quantity in quantities:
         own = named(trajectory.system, quantity)
@@ -154,7 +156,10 @@ def _lines(trajectory: Trajectory, quantities: Iterable[str]) -> dict[str, list[
             _Line(name, k if values.ndim > 1 else None, column, quantity, component(k, of_spans) * (values.ndim > 1))
             for k, column in enumerate(values.reshape(values.shape[0], -1).T)
         ]
-        out.setdefault(own.unit or own.word, []).extend(lines)
+        size = _STILL * max(float(np.max(np.abs(line.values))) for line in lines)
+        # All of a quantity that is zero.
+        kept = [line for line in lines if np.max(np.abs(line.values)) > size] or lines
+        out.setdefault(own.unit or own.word, []).extend(kept)
     order = [*_UNITS, *out]
     return dict(sorted(out.items(), key=lambda item: order.index(item[0])))
 

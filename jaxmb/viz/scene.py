@@ -85,7 +85,8 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
             # The first rows of joints whose points meet are the distances of these points.
             unmet = np.linalg.norm(residuals[name][:dimension])
             if unmet > least and np.isclose(unmet, np.linalg.norm(gap), atol=least):
-                text = f"{name}: {np.linalg.norm(gap):.3g} m apart"
+                largest[name] = float(np.linalg.norm(gap))
+                text = f"{name}: {largest[name]:.3g} m apart"
                 axes.plot(*np.stack([points[0], points[-1]]).T, color=_RED, linewidth=2, zorder=6)
         if is_open or len(bodies) + len(joints) <= _NAMES:
             names.append(Name(text, np.mean(points, axis=0), -1, {"color": _RED if is_open else "0.25"}))
@@ -107,7 +108,7 @@ def _residuals(system, t, state):
 
 
 def _title(largest, least) -> tuple[str, dict[str, Any]]:
-    """Words that say whether all joints close, from their largest residuals, and their style."""
+    """Words that say whether all joints close, from their gaps or largest residuals, and their style."""
     unmet = sorted((name for name, x in largest.items() if x > least), key=largest.__getitem__, reverse=True)
     if unmet:
         named = ", ".join(f"{name} by {largest[name]:.3g}" for name in unmet[:_TITLE])

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..linalg.rotations import rotation_matrix
-from ..parts.shapes import AbstractShape
+from ..parts.shapes import AbstractShape, Mesh
 from ..system.picture import Line
 from .solids import hull
 
@@ -18,6 +18,8 @@ _EDGES = {
     "cylinder": [_CIRCLE - _UP, _CIRCLE + _UP],
     "sphere": [_CIRCLE, np.roll(_CIRCLE, 1, axis=1), np.roll(_CIRCLE, 2, axis=1)],
 }
+# Into how many faces a circle, a bar along its length, and a ball from pole to pole are cut.
+_SEGMENTS, _ALONG, _BELTS = 32, 6, 10
 _COIL = np.array([0.0, 0.15, *np.linspace(0.2, 0.8, 12), 0.85, 1.0])
 
 
@@ -45,6 +47,33 @@ def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:
     return [_placed(shape, line) for line in _EDGES.get(shape.primitive, [])]
 
 
+def faces(shape: AbstractShape) -> list[Float[np.ndarray, "faces corners 3"]]:
+    """The faces [m] of a shape in the axes of its body, polygons by their numbers of corners; none of the ground."""
+    if shape.primitive == "ground":
+        return []
+    polygons = [shape.vertices[shape.faces]] if isinstance(shape, Mesh) else _UNIT[shape.primitive]
+    return [_placed(shape, polygon.reshape(-1, 3)).reshape(polygon.shape) for polygon in polygons]
+
+
+def _grid(points):
+    """The quadrilaterals between rows of points."""
+    a, b = points[:-1], points[1:]
+    return np.stack([a[:, :-1], a[:, 1:], b[:, 1:], b[:, :-1]], axis=2).reshape(-1, 4, 3)
+
+
+def _unit_faces():
+    """A bar is cut along its length, so that the faces in front of another body hide it."""
+    turn, height = np.linspace(0.0, 2 * np.pi, _SEGMENTS + 1), np.linspace(-0.5, 0.5, _ALONG + 1)
+    circle = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _BELTS + 1)[:, None]
+    ball = np.stack([np.cos(tilt) * circle[:, 0], np.cos(tilt) * circle[:, 1], np.sin(tilt) + 0 * turn], axis=2)
+    tube = _grid(circle + height[:, None, None] * 2 * _UP)
+    ends = np.stack([circle[:-1] - _UP, circle[:-1] + _UP])
+    square = np.stack([_SQUARE[:4] - _UP, _SQUARE[:4] + _UP])
+    box = np.concatenate([np.roll(square, k, axis=2) for k in range(3)])
+    return {"box": [box], "cylinder": [tube, ends], "sphere": [_grid(ball)]}
+
+
 def _placed(shape, points):
     return shape.position + (points * shape.scale) @ rotation_matrix(shape.orientation).T
 
@@ -70,3 +99,6 @@ def stroke(line: Line, time: int, width: float) -> Float[np.ndarray, "points 3"]
     sides = np.where(np.arange(len(_COIL) - 4) % 2 == 0, 1.0, -1.0)[:, None]
     out[2:-2] += 1.5 * width * sides * across / np.linalg.norm(across)
     return out
+
+
+_UNIT = _unit_faces()

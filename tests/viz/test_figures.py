@@ -61,9 +61,9 @@ def test_plot_motion_shows_the_place_and_the_stroke_of_a_piston(piston):
 
 
 def test_plot_motion_shows_quantities_by_name(piston):
-    # All of a part that describes its motion, also what stays at zero.
+    # All of a part that describes its motion, but the components of a vector that are zero.
     *of_piston, energy = viz.plot_motion(piston, ["piston", "energy"]).axes
-    assert [list(drawn(axes)) for axes in of_piston] == [["piston x", "piston y"]] * 2 + [["piston"]] * 2
+    assert [list(drawn(axes)) for axes in of_piston] == [["piston x"]] * 2 + [["piston"]] * 2
     assert list(drawn(energy)) == ["kinetic", "potential", "sum"]
     (one,) = (figure := viz.plot_motion(piston, "slide.displacement")).axes
     assert one.get_ylabel() == "displacement [mm]"

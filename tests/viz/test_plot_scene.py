@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 import jaxmb as mb
-from jaxmb import planar, spatial, viz
+from jaxmb import planar, shapes, spatial, viz
 from jaxmb.viz.mechanism import front_view
+from jaxmb.viz.silhouettes import faces
 
 MOST_PROGRAMS = 70
 
@@ -44,7 +45,7 @@ def test_plot_scene_shows_the_gaps_of_the_given_poses():
     assert {"crank", "rod", "rocker", "A", "spring"} <= texts
     assert f"B: {np.linalg.norm(rod - [1.0, 0.0]):.3g} m apart" in texts
     assert any(np.allclose(gap, [[1.0, 0.0], rod]) for gap in gaps) and len(gaps) == 3
-    assert title == "open joints [m, rad]: C by 0.367, B by 0.325, D by 0.162"
+    assert title == "open joints [m, rad]: C by 0.437, B by 0.402, D by 0.209"
 
 
 def test_plot_scene_shows_an_assembled_system():
@@ -180,3 +181,29 @@ def test_a_machine_in_an_upright_plane_is_seen_from_its_front(sizes, view):
     limits = dict(zip(("xlim", "ylim", "zlim"), ((0.0, float(size)) for size in sizes), strict=True))
     axes = Figure().add_subplot(projection="3d", **limits)
     assert front_view(axes, np.array([0.0, 0.0, 1.0])).get("azim") == view
+
+
+@pytest.mark.parametrize(
+    "shape, area, rounding",
+    [
+        (shapes.Box((1.0, 2.0, 3.0)), 22.0, 1e-12),
+        (shapes.Cylinder(0.5, 2.0), 2.5 * np.pi, 0.01),
+        (shapes.Sphere(2.0), 16 * np.pi, 0.03),
+        (shapes.Mesh(np.eye(3), [(0, 1, 2)]), np.sqrt(0.75), 1e-12),
+    ],
+)
+def test_faces_of_shapes_have_their_areas(shape, area, rounding):
+    """Also where shapes are turned; the ground has no faces."""
+    total = 0.0
+    for polygons in faces(shape.moved((1.0, 2.0, 3.0), shapes.along((1.0, 1.0, 0.0)))):
+        arms = polygons - polygons[:, :1]
+        total += np.linalg.norm(0.5 * np.cross(arms[:, :-1], arms[:, 1:]).sum(axis=1), axis=1).sum()
+    assert total == pytest.approx(area, rel=rounding)
+    assert faces(shapes.Ground()) == []
+
+
+def test_faces_of_joints_and_of_the_ground_let_bodies_be_seen():
+    _, axes = crowded(spatial, (1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    (drawn,) = axes.collections
+    opacities = drawn.get_facecolor()[:, 3]
+    assert 0 < np.mean(opacities == 1.0) < 1 and opacities.min() == 0.25
