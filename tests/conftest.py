@@ -16,8 +16,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # The programs that the short tests of a file may compile, eager operations too, unless it states its `MOST_PROGRAMS`.
 MOST_PROGRAMS = 60
 # Where Linux lists the memory maps of this process, and with how many of them traced and compiled programs are given
-# back: a process may have 65530. Until then files share them, which saves a sixth of the processor seconds.
-MAPS, MOST_MAPS = Path("/proc/self/maps"), 10_000
+# back after a file and after a test: a process may have 65530. Until then files share programs, which saves a sixth of
+# the processor seconds.
+MAPS, MANY_MAPS, MOST_MAPS = Path("/proc/self/maps"), 10_000, 30_000
 
 
 def pytest_addoption(parser):
@@ -88,10 +89,20 @@ _compiled = collections.Counter()
 jax.monitoring.register_event_duration_secs_listener(_note_compilation)
 
 
-@pytest.fixture(autouse=True)
-def _forget_programs():
-    """Give back the memory maps of compiled programs."""
+@pytest.fixture(autouse=True, scope="module")
+def _forget_programs_of_files():
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+    _forget_programs(MANY_MAPS)
+
+
+@pytest.fixture(autouse=True)
+def _forget_programs_of_tests():
+    yield
+    _forget_programs(MOST_MAPS)
+
+
+def _forget_programs(most):
+    """Give back the memory maps of compiled programs."""
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > most:
         eqx.clear_caches()
         jax.clear_caches()

@@ -13,8 +13,6 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND, AbstractLink
-from ..parts.combinations import Tendon
-from ..parts.rope import AbstractRope
 from ..parts.shapes import DARK, Box, ring, wheel
 from ..system.picture import Anchors, Line, Picture, in_space
 from .groups import FrameGroup, Group
@@ -101,11 +99,12 @@ def _shapes(part, space, width, followed):
 
 def _held(part, bodies, space):
     """The ends of a rope or a tendon on the ground, where blocks hold it."""
-    if isinstance(part, (AbstractRope, Tendon)):
-        on_circles = part.senses if isinstance(part, AbstractRope) else (0,) * len(part.owners)
-        for k in (0, -1):
-            if bodies[part.owners[k]] == GROUND and not on_circles[k]:
-                yield np.asarray(space.in_space(part.points[k]))
+    owners: Any = getattr(part, "owners", ()) if part.path_kind == "cord" else ()
+    # Of a tendon no point is on a circle.
+    on_circles = getattr(part, "senses", np.zeros(len(owners)))
+    for k in (0, -1) if owners else ():
+        if bodies[owners[k]] == GROUND and not on_circles[k]:
+            yield np.asarray(space.in_space(part.points[k]))
 
 
 def _gears(part, bodies, parts, positions, orientations, width):

@@ -30,7 +30,7 @@ _FEW = 8
 # Largest number of times in a title.
 _TIMES = 6
 # The least width of a picture, relative to its height, and the other way round.
-_THIN = 0.2
+_THIN = np.array([0.4, 0.2])
 # A machine in space is in one plane if it is this thin, relative to its size.
 _FLAT = 0.1
 _EDGE: Color = (40, 40, 40)

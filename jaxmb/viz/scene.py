@@ -1,16 +1,19 @@
 """A scene drawn before it moves: bodies and joints with their names, and joints that do not close."""
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._types import State
 from ..bodies.scene import Scene, as_given
+from ..parts.shapes import AbstractShape
 from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
 from ..trajectory import picture_of, still
 from .figure import color as color_of
 from .mechanism import drawn, finish, flat, in_world
+from .motion_nodes import check_shapes
 from .placed_names import Name, place_names
 from .solids import solids
 
@@ -24,7 +27,13 @@ _NAMES, _TITLE = 30, 3
 _RED = (0.8, 0.05, 0.1)
 
 
-def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: float = 0.0) -> "Figure":
+def plot_scene(
+    scene: Scene | AbstractSystem,
+    state: State | None = None,
+    *,
+    shapes: Mapping[str, AbstractShape | Sequence[AbstractShape]] | None = None,
+    t: float = 0.0,
+) -> "Figure":
     """Draw a scene with the names of its bodies and joints, before it is compiled, assembled or moved.
 
     ```python
@@ -37,12 +46,12 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     fails, the picture shows which joint is open.
 
     **Arguments:** `scene`: a `Scene`, at the poses given with its bodies, or a compiled system; `state` of a system,
-    default the poses found when it was compiled; `t`: the time, for driven joints [s].
+    default the poses found when it was compiled; `shapes` as in `show`; `t`: the time, for driven joints [s].
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows.
 
-    **Raises:** `ValueError` for a state without a system, and for a system without bodies; `ImportError` without
-    matplotlib.
+    **Raises:** `ValueError` for a state without a system, a system without bodies, and shapes of unknown bodies;
+    `ImportError` without matplotlib.
     """
     # A concrete class, since there is one kind of scene, and it has no state.
     if isinstance(scene, Scene):
@@ -56,9 +65,10 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
     if not system.body_names:
         raise ValueError(f"plot_scene draws bodies, and a {type(system).__name__} has none.")
     y: Any = system.guess if state is None else checked_state(system, state)
+    check_shapes(system, shapes or {})
     picture = picture_of(still(system, y, t))
-    shapes = solids(picture, {}, None)
-    figure, axes = drawn(picture, shapes, [0])
+    placed = solids(picture, shapes or {}, None)
+    figure, axes = drawn(picture, placed, [0])
     dimension, names = 2 if picture.planar else 3, []
     bodies = picture.bodies
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
@@ -91,7 +101,7 @@ def plot_scene(scene: Scene | AbstractSystem, state: State | None = None, *, t: 
         if is_open or len(bodies) + len(joints) <= _NAMES:
             names.append(Name(text, np.mean(points, axis=0), -1, {"color": _RED if is_open else "0.25"}))
     title, style = _title(largest, least)
-    finish(figure, axes, picture, shapes, title, **style)
+    finish(figure, axes, picture, placed, title, **style)
     if not picture.planar:
         names = [name._replace(place=flat(axes, name.place)) for name in names]
     place_names(figure, axes, names)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..linalg.rotations import rotation_matrix
-from ..parts.shapes import AbstractShape, Mesh
+from ..parts.shapes import AbstractShape
 from ..system.picture import Line
 from .solids import hull
 
@@ -51,7 +51,8 @@ def faces(shape: AbstractShape) -> list[Float[np.ndarray, "faces corners 3"]]:
     """The faces [m] of a shape in the axes of its body, polygons by their numbers of corners; none of the ground."""
     if shape.primitive == "ground":
         return []
-    polygons = [shape.vertices[shape.faces]] if isinstance(shape, Mesh) else _UNIT[shape.primitive]
+    triangles = getattr(shape, "faces", None)
+    polygons = _UNIT[shape.primitive] if triangles is None else [shape.vertices[triangles]]  # pyright: ignore
     return [_placed(shape, polygon.reshape(-1, 3)).reshape(polygon.shape) for polygon in polygons]
 
 

@@ -122,9 +122,14 @@ def test_balls_of_a_chain_of_masses_do_not_touch():
     count = 12
     masses = [planar.PointMass(f"m{k}", mass=1.0, position=(float(k), 0.0)) for k in range(count)]
     rods = [planar.Distance(f"rod{k}", f"m{k}", f"m{k + 1}", length=1.0) for k in range(count - 1)]
-    (axes,) = viz.plot_scene(mb.Scene(masses, joints=rods)).axes
+    scene = mb.Scene(masses, joints=rods)
+    (axes,) = viz.plot_scene(scene).axes
     balls = [np.ptp(patch.get_path().vertices[:, 0]) for patch in axes.patches]
     assert len(balls) == count and min(balls) > 0.05 and max(balls) < 0.5
+    (axes,) = viz.plot_scene(scene, shapes={"m1": shapes.Box((0.9, 0.1, 0.1))}).axes
+    assert any(np.ptp(patch.get_path().vertices[:, 0]) == pytest.approx(0.9) for patch in axes.patches)
+    with pytest.raises(ValueError, match="Unknown body 'm99'"):
+        viz.plot_scene(scene, shapes={"m99": shapes.Sphere(1.0)})
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -134,8 +139,8 @@ def test_plot_scene_has_room_beside_a_thin_machine(flat):
     ends = ["ground", *(body.name for body in bodies)]
     joints = [planar.Revolute(f"j{k}", ends[k], ends[k + 1], point=2 * k * way) for k in range(4)]
     (axes,) = viz.plot_scene(mb.Scene(bodies, joints=joints)).axes
-    long, thin = sorted((np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())))[::-1]
-    assert thin == pytest.approx(long / 5)
+    width, height = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
+    assert height / width == pytest.approx(0.2 if flat else 2.5)
 
 
 def overlaps(boxes):
