@@ -20,6 +20,7 @@ from typing import Any
 
 from ..parts.base import AbstractPart
 from ..parts.names import UnknownNameError, unknown
+from .topics import topics
 
 PACKAGE = __name__.split(".")[0]
 
@@ -358,10 +359,17 @@ def find(name: str) -> Entry:
 
 
 def _speaking_of(word: str) -> list[str]:
-    """At most six names with an argument or quantity of this name in their docstrings, shortest docstrings first."""
-    code = re.compile(rf"[`(, ]{re.escape(word)}(=|`)")
-    matches = [entry for entry in entries().values() if entry.kind != "module" and code.search(entry.text)]
-    return [entry.name for entry in sorted(matches, key=lambda entry: len(entry.text))[:6]]
+    """At most six names with an argument or quantity of this name in their docstrings, shortest docstrings first; else
+    names and topics that have the word, most often first.
+    """
+    code, said = re.compile(rf"[`(, ]{re.escape(word)}(=|`)"), re.compile(rf"\b{re.escape(word)}", re.I)
+    described = [entry for entry in entries().values() if entry.kind != "module"]
+    matches = [entry for entry in described if code.search(entry.text)]
+    if matches:
+        return [entry.name for entry in sorted(matches, key=lambda entry: len(entry.text))[:6]]
+    pages = {topic.name: topic.text for topic in topics().values()} | {x.name: x.text for x in described}
+    counts = {name: len(said.findall(text)) for name, text in pages.items()}
+    return [name for name in sorted(counts, key=lambda name: -counts[name])[:6] if counts[name]]
 
 
 def _found(name: str) -> Entry | None:

@@ -156,6 +156,10 @@ def test_help_on_an_unknown_name(capsys):
     assert "'SpringDamper'" in capsys.readouterr().err
     assert main(["help", "restitution"]) == 2
     assert "Stop" in capsys.readouterr().err
+    # Words that are no arguments, of names and topics.
+    for word, found in (("belt", "planar.Track"), ("hydraulic", "which-force")):
+        assert main(["help", word]) == 2
+        assert found in capsys.readouterr().err.split("is explained in")[1]
 
 
 def test_run_that_is_interrupted(capsys, monkeypatch):
