@@ -58,9 +58,9 @@ def plot_mechanism(
     jaxmb.viz.plot_mechanism([state, motion.end], system=system)
     ```
 
-    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars (in space lines) from the
-    mass centre to the points where parts act. Springs, rods and tracks are drawn between their points, and in the plane
-    the terrain. Up to 8 bodies have paths, along a motion, and a legend.
+    Bodies are drawn as in `show`: in the shapes of their parts, such as wheels, and as bars from the mass centre to the
+    points where parts act; in space the blocks of joints and of the ground are clear. Springs, rods and tracks are
+    drawn between their points, and in the plane the terrain. Up to 8 bodies have paths, along a motion, and a legend.
 
     **Arguments:** `trajectory`: a motion, also from `required_forces`, or a `State` or a list of states, with their
     `system`; `frames`: the number of poses of a motion, at least 1; `shapes` as in `show`; `deformation`: the factor by
