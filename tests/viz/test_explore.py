@@ -148,8 +148,8 @@ def test_explorer_follows_its_sliders(linkage):
         # Too short to reach the rocker: the page says it, and keeps the last motion.
         explorer._playing.value = False
         explorer.set({"B.point_b[0]": 0.9, "A.angle": 3.1})
-        until(lambda: explorer.problem)
-        assert "**No motion:**" in explorer._said.content and explorer.motion is not first
+        until(lambda: "**No motion:**" in explorer._said.content)
+        assert explorer.problem and explorer.motion is not first
         explorer.set({"B.point_b[0]": -1.5, "A.angle": 1.57})
         until(lambda: not explorer.problem)
         with pytest.raises(ValueError, match=r"Unknown slider 'coupler\.mas'"):
