@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._types import State
 from ..linalg.rotations import rotation_matrix
 from ..parts.base import GROUND, AbstractLink
-from ..parts.shapes import DARK, Box, ring, wheel
+from ..parts.shapes import ring, support, wheel
 from ..system.picture import Anchors, Line, Picture, in_space
 from .groups import FrameGroup, Group
 
@@ -50,11 +50,8 @@ def picture(
         gear for _, bodies, part in single for gear in _gears(part, bodies, parts, positions, orientations, width)
     ]
     up = _up(space, None if system.forces.gravity is None else np.asarray(system.forces.gravity))
-    shapes += [
-        (GROUND, Box(np.where(up == 0, 4.0, 2.4) * width, position=point + 1.2 * width * up, color=DARK))
-        for _, bodies, part in single
-        for point in _held(part, bodies, space)
-    ]
+    held = (point for _, bodies, part in single for point in _held(part, bodies, space))
+    shapes += [(GROUND, support(point, -up, width)) for point in held]
     # The friction of a joint acts where the joint does.
     of_laws = {law: joint for g in system.constraints.laws for law, joint in zip(g.group.names, g.joints, strict=True)}
     mass, moments = np.asarray(system.mass), np.asarray(system.moments_of_inertia)

@@ -277,6 +277,11 @@ def along(axis: VectorLike) -> np.ndarray:
     return half / np.linalg.norm(half)
 
 
+def support(point: np.ndarray, up: np.ndarray, width: float) -> Box:
+    """A block of the ground below a point [m], in the scale of bars of the radius `width` [m]; above it for `-up`."""
+    return Box(np.where(up == 0, 4.0, 2.4) * width, position=point - 1.2 * width * up, color=DARK)
+
+
 def capsule(radius: float, length: float, **place: Any) -> tuple[AbstractShape, ...]:
     """A cylinder along its z axis with a half ball at either end; `length` [m] without the half balls."""
     middle = Cylinder(radius, length, **place)

@@ -218,20 +218,21 @@ def _draw_faces(axes, picture, poses):
     polygons, colors, rims = [], [], []
     for shapes, time, fade in poses:
         for body, shape in shapes:
-            clear = body == GROUND or shape.color == DARK
-            for several in faces(shape):
-                corners = in_world(picture, body, several.reshape(-1, 3), time).reshape(several.shape)
-                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, -1])
-                size = np.linalg.norm(normals, axis=1, keepdims=True)
-                bright = np.abs(normals @ _LIGHT) / np.where(size > 0, size, 1.0)[:, 0]
-                shades = np.array(faded(shape.color, fade)) * (_DIM + (1 - _DIM) * bright[:, None])
-                polygons += list(corners)
-                colors += [(*shade, _CLEAR if clear else 1.0) for shade in shades]
-                rim = faded(_EDGE if shape.primitive == "box" else shape.color, fade)
-                rims += [(*rim, 1.0)] * len(corners) if shape.primitive == "box" else [(*x, 1.0) for x in shades]
+            own = faces(shape)
+            corners = in_world(picture, body, own.reshape(-1, 3), time).reshape(own.shape)
+            normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+            size = np.linalg.norm(normals, axis=1)
+            bright = np.abs(normals @ _LIGHT) / np.where(size > 0, size, 1.0)
+            shades = np.array(faded(shape.color, fade)) * (_DIM + (1 - _DIM) * bright[:, None])
+            opacity = np.full((len(own), 1), _CLEAR if body == GROUND or shape.color == DARK else 1.0)
+            polygons.append(corners)
+            colors.append(np.hstack([shades, opacity]))
+            # Of round shapes only the light shows the faces.
+            rims.append(np.broadcast_to(faded(_EDGE, fade), shades.shape) if shape.primitive == "box" else shades)
     if polygons:
+        polygons, colors, rims = map(np.concatenate, (polygons, colors, rims))
         axes.add_collection3d(Poly3DCollection(polygons, facecolors=colors, edgecolors=rims, linewidths=0.4))
-        axes.auto_scale_xyz(*np.concatenate(polygons).T)
+        axes.auto_scale_xyz(*polygons.reshape(-1, 3).T)
 
 
 def _draw_paths(axes, picture, time, fade):

@@ -47,13 +47,15 @@ def edges(shape: AbstractShape) -> list[Float[np.ndarray, "points 3"]]:
     return [_placed(shape, line) for line in _EDGES.get(shape.primitive, [])]
 
 
-def faces(shape: AbstractShape) -> list[Float[np.ndarray, "faces corners 3"]]:
-    """The faces [m] of a shape in the axes of its body, polygons by their numbers of corners; none of the ground."""
+def faces(shape: AbstractShape) -> Float[np.ndarray, "faces 4 3"]:
+    """The faces [m] of a shape in the axes of its body, as quadrilaterals, of which triangles have their last corner
+    twice; none of the ground.
+    """
     if shape.primitive == "ground":
-        return []
+        return np.zeros((0, 4, 3))
     triangles = getattr(shape, "faces", None)
-    polygons = _UNIT[shape.primitive] if triangles is None else [shape.vertices[triangles]]  # pyright: ignore
-    return [_placed(shape, polygon.reshape(-1, 3)).reshape(polygon.shape) for polygon in polygons]
+    unit = _UNIT[shape.primitive] if triangles is None else shape.vertices[triangles[:, [0, 1, 2, 2]]]  # pyright: ignore
+    return _placed(shape, unit.reshape(-1, 3)).reshape(unit.shape)
 
 
 def _grid(points):
@@ -69,10 +71,10 @@ def _unit_faces():
     tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _BELTS + 1)[:, None]
     ball = np.stack([np.cos(tilt) * circle[:, 0], np.cos(tilt) * circle[:, 1], np.sin(tilt) + 0 * turn], axis=2)
     tube = _grid(circle + height[:, None, None] * 2 * _UP)
-    ends = np.stack([circle[:-1] - _UP, circle[:-1] + _UP])
+    end = np.stack([0 * circle[1:], circle[:-1], circle[1:], circle[1:]], axis=1)
     square = np.stack([_SQUARE[:4] - _UP, _SQUARE[:4] + _UP])
     box = np.concatenate([np.roll(square, k, axis=2) for k in range(3)])
-    return {"box": [box], "cylinder": [tube, ends], "sphere": [_grid(ball)]}
+    return {"box": box, "cylinder": np.concatenate([tube, end - _UP, end + _UP]), "sphere": _grid(ball)}
 
 
 def _placed(shape, points):

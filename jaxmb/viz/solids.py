@@ -7,7 +7,7 @@ import numpy as np
 
 from ..linalg.rotations import from_matrix
 from ..parts.base import GROUND
-from ..parts.shapes import DARK, AbstractShape, Box, Color, Cylinder, Mesh, Sphere
+from ..parts.shapes import DARK, AbstractShape, Box, Color, Cylinder, Mesh, Sphere, support
 from ..system.picture import Picture
 
 # Distinct also for colour-blind readers, after Okabe and Ito, darkened for a white background.
@@ -49,7 +49,7 @@ def solids(
                     shape.moved(-picture.centres[name], np.array([1.0, 0.0, 0.0, 0.0])) for shape in body_shapes
                 ]
         elif name == GROUND:
-            body_shapes = [_support(point, picture.up, width) for point in points[name]]
+            body_shapes = [support(point, picture.up, width) for point in points[name]]
         else:
             body_shapes = [] if name in picture.owners else _linkage(points[name], picture.planar, width)
             if not body_shapes and name in on_bars:
@@ -115,11 +115,6 @@ def _turn(a, b, origin):
     """The third component of the product of two arms from an origin, positive for a turn to the left."""
     a, b = a - origin, b - origin
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _support(point, up, width):
-    """A block below a point of the ground."""
-    return Box(np.where(up == 0, 4.0, 2.4) * width, position=point - 1.2 * width * up, color=DARK)
 
 
 def _equivalent(mass, moments, width) -> list[AbstractShape]:
