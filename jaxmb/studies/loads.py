@@ -110,7 +110,8 @@ class Loads(Printed, eqx.Module):
     def plot(self, *names: str, t: float | None = None) -> "Figure":
         """Draw the loads on the body, in its axes, as arrows with their sizes, and plot the sizes against time.
 
-        The moments beside the arrows are about the points of application; in the plane they are positive to the left.
+        The moments beside the arrows are about the points of application; in the plane they are positive to the left,
+        as bent arrows show.
         Loads that act at a single point are bars.
 
         **Arguments:** `names` of loads, default the eight largest; `t`: the time of the arrows [s], default the time of

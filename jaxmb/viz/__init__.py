@@ -4,8 +4,8 @@ Results draw themselves by `plot()`, as `jaxmb help pictures` shows. `plot_scene
 where it cannot be assembled; `plot_motion` draws quantities over time; `save_movie` writes an animated GIF or a film.
 `explore` has sliders for numbers and joints. `show`, `explore` and `plot_mechanism` draw wheels, gears, pins, springs,
 ropes, tracks and terrain; other bodies are bars from the mass centre to their frames and to the points where parts act.
-`show`, `plot_mechanism` and `plot_scene` also take other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`,
-or `shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the
+All of them but `explore` also take other shapes: `shapes={"crank": jaxmb.shapes.Box((1.0, 0.1, 0.1))}`, or
+`shapes.Mesh.read(file)`; a user-defined part defines them by its methods `shapes` and `path`. A picture shows the
 saved states only. A moving picture takes about 0.9 MB, including 0.82 MB for viser's viewer, needs no network, and also
 plays in notebooks exported to HTML.
 

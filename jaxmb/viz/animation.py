@@ -90,8 +90,8 @@ def show(
     - `points`: the names of bodies (mass centres), frames or joints that leave a trail, or a single name.
     - `reactions`, `forces`: names of joints and of force elements whose forces are drawn as arrows, all to one scale.
         Arrows act on the last body of a joint, and on each body of a force element.
-    - `shapes`: by name of a body, or `"ground"`, one or several shapes from `jaxmb.shapes` instead of the default, each
-        placed in the frame of the body.
+    - `shapes`: by name of a body, or `"ground"`, one or several shapes from `jaxmb.shapes` instead of the default and
+        of blocks of joints, each placed in the frame of the body.
     - `frames`: the largest number of saved times that are shown.
     - `speed` of playing, 1 for real time. By default motions play in real time, but for at least 2 s and at most a
         minute. The slider shows the playing time, the picture the time of the motion.

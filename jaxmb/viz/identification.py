@@ -11,6 +11,9 @@ from .figure import chosen, color, finish_panel, new_figure, shown_unit, with_un
 
 # The largest number of rows, and the residual [σ] beyond which outliers have a ring.
 _ROWS, _FAR = 8, 5.0
+# Measured values are rings; the sum of the diameters of many [points].
+_HOLLOW: dict[str, Any] = {"fillstyle": "none", "markeredgewidth": 0.8}
+_RING = 500.0
 
 
 def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0.95) -> Any:
@@ -33,7 +36,7 @@ def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0
         _draw_residuals(right, of_row)
     for axes in places[-1]:
         axes.set_xlabel("t [s]")
-    parts = ["• measured", "– fitted"] + ([f"shaded: {level:.0%} confidence"] if bands else [])
+    parts = ["○ measured", "– fitted"] + ([f"shaded: {level:.0%} confidence"] if bands else [])
     more = f"; {len(shown)} of {len(rows)} sensors, those with the largest residuals" if len(shown) < len(rows) else ""
     verdict = "" if fit.converged else "Not to be trusted: see fit.warnings. "
     tint = "firebrick" if verdict else "black"
@@ -42,14 +45,16 @@ def plot(fit: Identification, names: Sequence[str] = (), level: float | None = 0
 
 
 def _draw_fit(fit, axes, row, of_row, bands):
-    """Data as dots, and the fit as lines in the same colours."""
+    """Data as rings, and the fit as lines in the same colours."""
     experiment, sensor = row
     channel = _channel(fit, experiment, sensor)
     own = named(fit.problem.system, channel.quantity)
     measured = [one.predicted - one.residuals * one.sigma for one in of_row]
     factor, unit = shown_unit(own.unit, *measured)
     for k, (one, data) in enumerate(zip(of_row, measured, strict=True)):
-        axes.plot(one.ts, factor * data, ".", color=color(k), markersize=4, alpha=0.55, markeredgewidth=0)
+        # Rings are seen beside a line; many are small, so that they do not merge.
+        size = float(np.clip(_RING / data.size, 2.0, 5.0))
+        axes.plot(one.ts, factor * data, "o", color=color(k), markersize=size, alpha=0.7, **_HOLLOW)
         axes.plot(one.ts, factor * one.predicted, color=color(k), linewidth=1.4, label=one.label)
         if (experiment, channel.quantity) in bands:
             ts, low, high = bands[experiment, channel.quantity]

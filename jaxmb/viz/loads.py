@@ -10,8 +10,8 @@ from .figure import MOST, Curve, Panel, check_single, chosen, color, draw, new_f
 
 # Arrows of forces, and moments, below this part of the largest are not drawn.
 _SMALL = 0.05
-# The longest arrow, and distances of texts, as parts of the body's size.
-_LONGEST, _BESIDE, _LINE = 0.4, 0.03, 0.07
+# The longest arrow, distances of texts and the radius of arrows of moments, as parts of the body's size.
+_LONGEST, _BESIDE, _LINE, _RADIUS = 0.4, 0.03, 0.07, 0.08
 _BODY = "0.82"
 
 
@@ -80,6 +80,8 @@ def _arrows(axes, now, centre, colors, dimension):
             text += f", {per_moment * (moments[k, 2] if dimension == 2 else turn):.3g} {moment_unit}".replace("-", "−")
         axes.plot(*points[k], "o", color=colors[k], markersize=5, zorder=4)
         end = points[k] + way
+        if dimension == 2 and turn >= least:
+            _turning(axes, points[k], _RADIUS * extent, moments[k, 2], way, colors[k])
         if dimension == 3:
             axes.quiver(*points[k], *way, color=colors[k], linewidth=2, arrow_length_ratio=0.2)
             axes.text(*end, text, color=colors[k], fontsize="small")
@@ -92,7 +94,7 @@ def _arrows(axes, now, centre, colors, dimension):
         written.append(place)
         sides = {"ha": "left" if way[0] >= 0 else "right", "va": "bottom" if way[1] >= 0 else "top"}
         axes.text(*place, text, color=colors[k], fontsize="small", zorder=6, **sides)
-        axes.update_datalim([end, place + np.sign(way[0]) * np.array([0.35 * extent, 0.0])])
+        axes.update_datalim([end, place + np.array([0.35 * extent * (1 if way[0] >= 0 else -1), 0.0])])
     axes.autoscale_view()
     axes.margins(0.08)
     axes.set_aspect("equal", **({"adjustable": "datalim"} if dimension == 2 else {}))
@@ -100,6 +102,18 @@ def _arrows(axes, now, centre, colors, dimension):
     axes.grid(alpha=0.3)
     if dimension == 3:
         axes.set_zlabel("z of the body [m]")
+
+
+def _turning(axes, point, radius, moment, way, color):
+    """An arrow around a point, in the sense of a moment in the plane, that leaves out the direction of the force."""
+    from matplotlib.patches import FancyArrowPatch
+    from matplotlib.path import Path
+
+    around = np.arctan2(way[1], way[0]) + np.radians(np.linspace(40.0, 320.0, 40))[:: 1 if moment > 0 else -1]
+    corners = point + radius * np.column_stack([np.cos(around), np.sin(around)])
+    arrow = {"arrowstyle": "-|>", "color": color, "lw": 1.6, "fill": True, "mutation_scale": 14}
+    axes.add_patch(FancyArrowPatch(path=Path(corners), zorder=3, **arrow))
+    axes.update_datalim(corners)
 
 
 def _bars(axes, names, sizes, colors):

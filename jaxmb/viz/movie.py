@@ -3,19 +3,20 @@
 import io
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .._arguments import whole_number
+from ..parts.shapes import AbstractShape
 from ..system.picture import Picture
 from ..trajectory import Trajectory, picture_of
 from .mechanism import drawn, faded, finish, in_world
-from .motion_nodes import chosen
+from .motion_nodes import check_shapes, chosen
 from .silhouettes import area, edges
-from .solids import COLORS, solids
+from .solids import COLORS, Placed, solids
 
 # A motion takes at least and at most so many seconds, if no speed is given. A frame takes a multiple of `_TICK` s.
 _SHORTEST, _LONGEST, _TICK = 2.0, 20.0, 0.01
@@ -30,6 +31,7 @@ def save_movie(
     frames: int = 100,
     speed: float | None = None,
     trails: bool = True,
+    shapes: Mapping[str, AbstractShape | Sequence[AbstractShape]] | None = None,
     deformation: float = 1.0,
 ) -> Path:
     """Write a motion as an animated GIF, which pages, slides and chats show, or as a film in MP4.
@@ -47,7 +49,8 @@ def save_movie(
     - `path` of the file, `.gif` or `.mp4`.
     - `frames`: the largest number of saved times that are drawn.
     - `speed` of playing, 1 for real time; by default a motion plays in real time, but for 2 to 20 s.
-    - `trails`: whether the mass centres of up to 8 bodies leave a trail; `deformation` as in `plot_mechanism`.
+    - `trails`: whether the mass centres of up to 8 bodies leave a trail; `shapes` and `deformation` as in
+        `plot_mechanism`.
 
     **Returns:** the path.
 
@@ -65,11 +68,14 @@ def save_movie(
         raise ValueError(f"speed must be a positive number, got {speed!r}.")
     if not trajectory.system.body_names:
         raise ValueError(f"A moving picture shows bodies, and a {type(trajectory.system).__name__} has none.")
+    check_shapes(trajectory.system, shapes or {})
     motion = chosen(trajectory, frames)
     picture, times = picture_of(motion, deformation), np.asarray(motion.ts)
     lasts = float(times[-1] - times[0])
     lasts = float(np.clip(lasts, _SHORTEST, _LONGEST)) if speed is None else lasts / speed
-    _WRITERS[path.suffix](path, _drawn(picture, times, trails), lasts / (times.size - 1))
+    _WRITERS[path.suffix](
+        path, _drawn(picture, solids(picture, shapes or {}, None), times, trails), lasts / (times.size - 1)
+    )
     return path
 
 
@@ -94,8 +100,7 @@ def _write_mp4(path, images, duration):
 _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
-def _drawn(picture: Picture, times: np.ndarray, trails: bool) -> Iterator[io.BytesIO]:
-    shapes = solids(picture, {}, None)
+def _drawn(picture: Picture, shapes: list[Placed], times: np.ndarray, trails: bool) -> Iterator[io.BytesIO]:
     low, high = _bounds(picture, shapes, times.size)
     dimension = 2 if picture.planar else 3
     for k, t in enumerate(times):

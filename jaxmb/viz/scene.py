@@ -7,6 +7,7 @@ import numpy as np
 
 from .._types import State
 from ..bodies.scene import Scene, as_given
+from ..parts.names import unknown
 from ..parts.shapes import AbstractShape
 from ..simulate.arguments import checked_state
 from ..system import AbstractSystem
@@ -32,6 +33,7 @@ def plot_scene(
     state: State | None = None,
     *,
     shapes: Mapping[str, AbstractShape | Sequence[AbstractShape]] | None = None,
+    names: Sequence[str] | None = None,
     t: float = 0.0,
 ) -> "Figure":
     """Draw a scene with the names of its bodies and joints, before it is compiled, assembled or moved.
@@ -46,11 +48,12 @@ def plot_scene(
     fails, the picture shows which joint is open.
 
     **Arguments:** `scene`: a `Scene`, at the poses given with its bodies, or a compiled system; `state` of a system,
-    default the poses found when it was compiled; `shapes` as in `show`; `t`: the time, for driven joints [s].
+    default the poses found when it was compiled; `shapes` as in `show`; `names`: the bodies and joints whose names are
+    written, default all, up to 30; open joints have theirs; `t`: the time, for driven joints [s].
 
     **Returns:** a matplotlib `Figure`, axes in m, which a notebook's cell shows.
 
-    **Raises:** `ValueError` for a state without a system, a system without bodies, and shapes of unknown bodies;
+    **Raises:** `ValueError` for a state without a system, a system without bodies, and unknown bodies or joints;
     `ImportError` without matplotlib.
     """
     # A concrete class, since there is one kind of scene, and it has no state.
@@ -69,14 +72,23 @@ def plot_scene(
     picture = picture_of(still(system, y, t))
     placed = solids(picture, shapes or {}, None)
     figure, axes = drawn(picture, placed, [0])
-    dimension, names = 2 if picture.planar else 3, []
+    dimension, written = 2 if picture.planar else 3, []
     bodies = picture.bodies
     joints = {name: part for name, part in picture.parts.items() if any(x is not None for x in part.points)}
+    known = [*bodies, *joints]
+    if names is None:
+        names = known if len(known) <= _NAMES else bodies if len(bodies) <= _NAMES else []
+        marked = list(joints)
+    else:
+        marked = names
+    for name in names:
+        if name not in known:
+            raise unknown("body or joint", name, known, "plot_scene")
     for k, name in enumerate(bodies):
         color, place = color_of(k), picture.positions[name][0, :dimension]
         axes.plot(*place, "o", color=color, markersize=4, zorder=4)
-        if len(bodies) <= _NAMES:
-            names.append(Name(name, place, 1, {"color": color, "weight": "bold"}))
+        if name in names:
+            written.append(Name(name, place, 1, {"color": color, "weight": "bold"}))
     residuals = _residuals(system, t, y)
     least = _OPEN * float(system.length)
     largest = {name: float(np.max(np.abs(values))) for name, values in residuals.items()}
@@ -87,6 +99,8 @@ def plot_scene(
             if point is not None
         ]
         is_open = largest.get(name, 0.0) > least
+        if not (is_open or name in marked):
+            continue
         for point in points:
             axes.plot(*point, "o", color=_RED if is_open else "black", markerfacecolor="white", markersize=5, zorder=5)
         text = name
@@ -98,13 +112,13 @@ def plot_scene(
                 largest[name] = float(np.linalg.norm(gap))
                 text = f"{name}: {largest[name]:.3g} m apart"
                 axes.plot(*np.stack([points[0], points[-1]]).T, color=_RED, linewidth=2, zorder=6)
-        if is_open or len(bodies) + len(joints) <= _NAMES:
-            names.append(Name(text, np.mean(points, axis=0), -1, {"color": _RED if is_open else "0.25"}))
+        if is_open or name in names:
+            written.append(Name(text, np.mean(points, axis=0), -1, {"color": _RED if is_open else "0.25"}))
     title, style = _title(largest, least)
     finish(figure, axes, picture, placed, title, **style)
     if not picture.planar:
-        names = [name._replace(place=flat(axes, name.place)) for name in names]
-    place_names(figure, axes, names)
+        written = [name._replace(place=flat(axes, name.place)) for name in written]
+    place_names(figure, axes, written)
     return figure
 
 

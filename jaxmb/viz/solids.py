@@ -57,7 +57,9 @@ def solids(
             elif not body_shapes and not of_parts[name] and name in picture.bodies:
                 body_shapes = _equivalent(*picture.inertias[name], width)
         color = _GROUND if name == GROUND else color_in(picture, name, tint)
-        out += [(name, shape.colored(color)) for shape in (*body_shapes, *of_parts[name])]
+        # Blocks of joints would hide given shapes.
+        kept = [shape for shape in of_parts[name] if name not in given or shape.color != DARK]
+        out += [(name, shape.colored(color)) for shape in (*body_shapes, *kept)]
     return out
 
 

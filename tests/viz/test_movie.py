@@ -10,7 +10,7 @@ from PIL import Image
 from trajectories import motion_of
 
 import jaxmb as mb
-from jaxmb import planar, viz
+from jaxmb import planar, shapes, viz
 
 TS = np.linspace(0.0, 3.0, 7)
 
@@ -35,6 +35,15 @@ def test_save_movie_draws_the_saved_states_in_their_time(swing, tmp_path):
             seen.append(np.asarray(picture.convert("L"), float))
     assert len({frame.shape for frame in seen}) == 1
     assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in itertools.pairwise(seen))
+
+
+def test_save_movie_draws_given_shapes(swing, tmp_path):
+    """A large box hides the pin, and fills much of the picture."""
+    filled = []
+    for given in ({}, {"bar": shapes.Box((1.0, 1.0, 0.1))}):
+        with Image.open(viz.save_movie(swing, tmp_path / "swing.gif", frames=2, shapes=given)) as picture:
+            filled.append(np.mean(np.asarray(picture.convert("L")) < 200))
+    assert filled[1] > 3 * filled[0]
 
 
 def test_save_movie_leaves_out_states_beyond_a_number_of_frames(swing, tmp_path):

@@ -8,6 +8,7 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 import jaxmb as mb
 from jaxmb import planar, shapes, spatial, viz
+from jaxmb.parts.shapes import DARK
 from jaxmb.viz.mechanism import front_view
 from jaxmb.viz.silhouettes import faces
 
@@ -53,6 +54,28 @@ def test_plot_scene_shows_an_assembled_system():
     texts, gaps, title = read(viz.plot_scene(system, mb.assemble(system, fix={"crank.angle": 1.0})))
     assert texts == {"crank", "rod", "rocker", "A", "B", "C", "D", "spring"}
     assert gaps == [] and title == "all joints are closed"
+
+
+def test_plot_scene_writes_chosen_names_and_those_of_open_joints():
+    texts, gaps, _ = read(viz.plot_scene(four_bar(), names=["rod", "A"]))
+    assert {"rod", "A"} == {text for text in texts if "apart" not in text} and len(texts) == 5 and len(gaps) == 3
+    system = four_bar().compile()
+    state = mb.assemble(system, fix={"crank.angle": 1.0})
+    assert read(viz.plot_scene(system, state, names=[]))[0] == set()
+    with pytest.raises(ValueError, match="Unknown body or joint .rood.*rod"):
+        viz.plot_scene(system, names=["rood"])
+
+
+def test_given_shapes_stand_in_place_of_blocks_of_joints():
+    """A slide's sleeve would hide the car that it carries."""
+    car = planar.Body("car", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    rail = planar.Prismatic("rail", "ground", "car", axis=(1.0, 0.0), point=(0.0, 0.0))
+    system = mb.Scene([car], joints=[rail]).compile()
+    sleeve, box = (*(np.array(DARK) / 255), 1.0), shapes.Box((2.0, 1.0, 1.0))
+    is_sleeve = lambda patch: np.allclose(patch.get_facecolor(), sleeve) and patch.get_xy()[:, 1].max() > 0
+    for given, count in (({}, 1), ({"car": box}, 0)):
+        patches = viz.plot_scene(system, shapes=given).axes[0].patches
+        assert sum(map(is_sleeve, patches)) == count
 
 
 def test_plot_scene_shows_a_scene_that_cannot_be_compiled():

@@ -253,6 +253,10 @@ def test_loads_are_arrows_on_the_body_and_curves():
     arrows = {tuple(text.xyann): np.asarray(text.xy) for text in body.texts if not text.get_text()}
     np.testing.assert_allclose(arrows[0.0, 0.0] / np.linalg.norm(arrows[0.0, 0.0]), (1.0, 0.0), atol=1e-12)
     np.testing.assert_allclose(arrows[1.0, 0.0][1] / (arrows[0.0, 0.0][0]), -2.5)
+    (turn,) = body.patches
+    # To the right about the heel, which is the origin.
+    (x, y), (along_x, along_y) = turn.get_path().vertices[:2]
+    assert x * along_y - y * along_x < 0
     assert labels(force) == list(loads.names) and force.get_ylabel() == "force [kN]"
     np.testing.assert_allclose(force.lines[0].get_ydata(), [2.0, 4.0, 0.8])
     assert moment.get_ylabel() == "moment [N m]"
