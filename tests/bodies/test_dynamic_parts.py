@@ -179,7 +179,7 @@ class SpatialRocket(spatial.AbstractRigidBody, parts.AbstractDynamicPart):
     mass, state_rates = PlanarRocket.mass, PlanarRocket.state_rates
 
 
-@pytest.mark.slow("space")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "space", "inertia"),
     [(PlanarRocket, planar, 1.0), (SpatialRocket, spatial, np.eye(3))],

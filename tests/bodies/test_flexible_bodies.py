@@ -152,6 +152,7 @@ def test_flexible_body_in_a_plane_moves_by_lagrange():
     np.testing.assert_allclose(energy, lagrange, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_flexible_bodies_in_a_chain_are_eliminated_in_blocks():
     """Twelve links, each hung on the bob of the one before: as by a full matrix."""
     links = [
@@ -302,6 +303,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 def test_flexible_body_in_single_precision():
     """Accelerations of a pendulum, near those in double precision."""
     out = []

@@ -74,6 +74,7 @@ def test_balls_that_strike_together_have_their_own_times():
     np.testing.assert_allclose(energy, sum(0.5 * masses[n] * speeds[n] ** 2 * (1 - bounces[n] ** 2) for n in "ab"))
 
 
+@pytest.mark.slow
 def test_each_group_has_its_own_energy_balance():
     """A rod whose rebound by Newton's law would gain energy, beside a ball, at one moment."""
     reach, inertia = (-0.636, -1.331), 0.0675

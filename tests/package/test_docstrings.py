@@ -361,7 +361,7 @@ def test_every_joint_has_an_example():
     assert exported(planar, kinds) == PLANAR.keys() and exported(spatial, kinds) == SPATIAL.keys()
 
 
-@pytest.mark.slow(*(f"jaxmb.spatial-{name}" for name in LONG_OF_JOINTS))
+@pytest.mark.slow(*(f"jaxmb.spatial-{name}" for name in LONG_OF_JOINTS), "jaxmb.planar-InextensibleBeam")
 @pytest.mark.parametrize(("module", "name"), JOINTS, ids=lambda own: getattr(own, "__name__", own))
 def test_examples_of_joints(module, name):
     """Their docstrings say what they connect, and which coordinates they have, with these values in the example."""

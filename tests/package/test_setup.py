@@ -284,6 +284,7 @@ def test_the_readme_names_each_way_to_compile():
     assert len(ways) == 4 and all(f'`"{way}"`' in text for way in ways)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="Threads are counted where the system lists them.")
 def test_lapack_has_one_thread_unless_the_environment_has_a_number():
     code = """
@@ -300,6 +301,7 @@ print(len(os.listdir("/proc/self/task")) - before)
     assert [process(each)[0] for each in (code, given)] == [0, min(cores(), 2) - 1]
 
 
+@pytest.mark.slow
 def test_a_kept_program_calls_lapack_in_a_process_that_has_lowered_none(tmp_path):
     """JAX finds LAPACK while it lowers a program, and a program that is found by its trace is not lowered."""
     code = """

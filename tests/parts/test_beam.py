@@ -289,6 +289,7 @@ def test_nodes_between_beams_of_several_lengths(lengths):
     np.testing.assert_allclose(np.sum(masses), places[-1], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_frequencies_of_an_elastic_chain():
     """Of a thin cantilever. They err by the fourth power of the length of a beam: with 4 beams by twenty times as much,
     and with 8 inextensible beams by 0.7 percent.

@@ -213,6 +213,7 @@ def test_what_needs_smooth_forces_refuses_it():
         mb.Scene([BODY], joints=[SLIDE, mb.DryFriction("rub", "joint", coefficient=0.3)])
 
 
+@pytest.mark.slow
 def test_ball_rubs_on_a_surface_of_the_user_as_on_the_slope_that_it_is():
     """Also where its normal is known only by automatic differentiation."""
     ball = spatial.Body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.3))

@@ -161,6 +161,7 @@ def test_constraint_of_other_numbers(kind, space, key):
     np.testing.assert_allclose(own.value, own.residual(own.other, own.elsewhere), rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow("spatial: Beam")
 @of(lambda space: springs(space, 0.0))
 def test_spring_power_is_loss_of_energy(space, key):
     own = push(space, key)

@@ -17,6 +17,7 @@ X, Y = np.array([-0.7, 0.1, 0.4, 1.0, 1.1]), np.array([0.3, -1.0, 0.8, 0.5, 2.0]
 value = jax.jit(jax.vmap(local_spline.value, in_axes=(None, None, 0)))
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_points_of_a_table():
     """Forwards, backwards and by differences, inside and beyond the table; of the spline and its integral."""
 

@@ -105,6 +105,7 @@ def test_a_hinge_that_is_driven_through_two_turns_in_space():
     np.testing.assert_allclose(motion["hip"].angle, 0.1 + 8.0 * motion.ts, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_turns_are_counted_beside_joints_of_elements():
     """The derivatives of all rows by the coordinates, of the count of turns as well."""
     system = hinged(joints=[mb.FixedTendon("cord", "hip.angle", coefficients=(0.3,))])

@@ -660,6 +660,7 @@ LIMITS = {
 }
 
 
+@pytest.mark.slow
 def test_rope_limits_are_told():
     kinds = {"taut": {}, "elastic": {"stiffness": 1e4}, "slack": {"slack": True}}
     system = hoist(**kinds)

@@ -42,7 +42,7 @@ def batch():
 SHORT = ("energies", "violation", "quantities")
 
 
-@pytest.mark.slow("all")
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [SHORT, tuple(VIEWS)], ids=["some", "all"])
 def test_views_of_a_batch_are_those_of_its_members(batch, names):
     """One program for the views of the batch, and one for those of a member."""

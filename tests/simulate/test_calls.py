@@ -70,7 +70,7 @@ RUNS = {
 }
 
 
-@pytest.mark.slow(but=("dense", "contacts"))
+@pytest.mark.slow(but=("contacts",))
 @pytest.mark.parametrize("name", RUNS)
 def test_results_do_not_depend_on_where_a_call_ends(name, monkeypatch):
     """To the last bit."""
@@ -199,6 +199,7 @@ def test_continued_motion_goes_on_with_its_history(name):
     assert counts[1] < again.stats["num_steps"] or name == "Tsit5"
 
 
+@pytest.mark.slow
 def test_continued_motions_join(traced):
     machine = mb.mechanisms.four_bar()
     first = mb.simulate(machine.system, machine.state, t1=1.0, saveat=[0.0, 0.5, 1.0])

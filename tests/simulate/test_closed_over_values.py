@@ -53,6 +53,7 @@ def test_what_functions_close_over_has_derivatives(run, x):
 STONE = mb.Scene([planar.PointMass("stone", mass=1.0)], forces=[mb.Gravity((0.0, -10.0))]).compile()
 
 
+@pytest.mark.slow
 def test_motion_of_numbers_within_a_trace_is_computed_there():
     """And its failure is told there."""
     fallen = lambda **options: mb.simulate(STONE, STONE.guess, t1=0.6, **options).ys.q[-1, 1]

@@ -142,6 +142,7 @@ def test_forward_mode_is_reverse_mode_and_that_of_the_discrete_solution(name, mo
     np.testing.assert_allclose(forward / scale, exact / scale, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_hessians_and_batches_need_no_option():
     """Against differences of gradients, and these against differences of values, for each member of a batch."""
 

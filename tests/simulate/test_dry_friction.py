@@ -86,6 +86,7 @@ def test_block_on_a_belt_sticks_and_slips():
     np.testing.assert_allclose(found[np.isfinite(found)], times[2:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_coefficients_and_forces_follow_their_inputs():
     """The numbers of the laws at each time; stick never has the smaller one."""
     brake = mb.Series([0.0, 1.0], [0.2, 0.6], "linear")

@@ -94,6 +94,7 @@ def test_free_body_whose_parameters_are_all_zero_is_refused(free):
         mb.simulate(free, scaled(free.guess, 0.0), t1=1.0)
 
 
+@pytest.mark.slow
 def test_assembly_does_not_depend_on_the_length(door):
     """It finds the closest state to the directions."""
     far = dataclasses.replace(door.guess, q=door.guess.q + np.array([0.1, 0.2, 0.0, 0.0, 0.1, 0.0, 0.2]))

@@ -44,6 +44,7 @@ def rotors():
     return mb.Scene([rotor(f"rotor{k}") for k in range(5)], joints=list(JOINTS.values()), forces=motors).compile()
 
 
+@pytest.mark.slow
 def test_hinge_saved_at_the_end_only_counts_its_turns(wheel):
     """By 4 rad, by 64 turns on from there, and back: the state at the end carries the turns."""
 
@@ -58,6 +59,7 @@ def test_hinge_saved_at_the_end_only_counts_its_turns(wheel):
         np.testing.assert_allclose(angle, known, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_turns_of_a_state():
     """An angle that is given beyond half a turn; the screw's displacement tells its turns."""
     joints = [JOINTS["hinge"], JOINTS["screw"]]

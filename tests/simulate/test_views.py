@@ -52,6 +52,7 @@ def moved(system, turn=0.0):
     return motion_of(system, jnp.asarray(TIMES), jnp.asarray(q), jnp.asarray(u))
 
 
+@pytest.mark.slow
 def test_view_is_one_program_for_all_parts_of_its_kind_and_all_numbers(chain):
     motion, other = moved(chain), moved(mb.with_parameters(chain, {"link1.mass": 7.0, "motor2.torque": 1.5}), turn=0.4)
     for name, view in VIEWS.items():

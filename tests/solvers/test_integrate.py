@@ -16,6 +16,7 @@ SWING = (diffrax.ODETerm(lambda t, p, args: p), diffrax.ODETerm(lambda t, q, arg
 CONTROL = diffrax.PIDController(rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_event_of_a_run_backwards_sees_the_time_of_the_user():
     event = diffrax.Event(lambda t, y, args, *, t0, t1, **_: t - (t0 + 0.4 * (t1 - t0)), optx.Newton(1e-10, 1e-10))
     out = integrate(DECAY, diffrax.Tsit5(), 0.0, -1.0, None, 1.0, 1.5, stepsize_controller=CONTROL, event=event)

@@ -81,6 +81,7 @@ def _solve(term, t1=12.0, tolerance=1e-8, **kwargs):
     return diffrax.diffeqsolve(term, Adams(), 0.0, t1, None, np.array([1.0, 0.0]), **kwargs)
 
 
+@pytest.mark.slow
 def test_charts_and_failed_evaluations():
     """Changes of charts leave states on the manifold and orders high; failed evaluations retry a step, or end all."""
 

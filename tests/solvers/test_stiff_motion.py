@@ -129,6 +129,7 @@ def slider():
 START = mb.State(np.array([1e-3, 0.0, 0.0]), np.zeros(3))
 
 
+@pytest.mark.slow
 def test_mass_on_a_spring_moves_by_its_closed_form():
     """Soft, vibrating, and on a transient after which the motion is ten thousand times slower."""
     system, times = slider(), np.array([1e-7, 1e-6, 1e-5, 1e-3, 0.05])

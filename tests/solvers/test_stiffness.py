@@ -36,6 +36,7 @@ def counted(field, t1, y0, args, rtol, word="count"):
     return out.result, found.found, found.steps / out.stats["num_accepted_steps"], out.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_stiffness_is_each_members_own():
     """Found where a fast transient has died away, and not where the motion is as fast, or slow."""
     field = lambda t, y, a: -a[0] * (y - jnp.cos(a[1] * t))

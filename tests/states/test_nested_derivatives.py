@@ -4,6 +4,7 @@ by each of several.
 
 import jax
 import numpy as np
+import pytest
 
 import jaxmb as mb
 from jaxmb import planar
@@ -11,6 +12,7 @@ from jaxmb import planar
 G = 9.81
 
 
+@pytest.mark.slow
 def test_equilibrium_has_mixed_second_derivatives():
     """A pendulum on a spring: k angle = −m g l cos(angle)."""
     bob = planar.Body("bob", mass=2.0, inertia=0.1, position=(0.0, -1.0), angle=-np.pi / 2)

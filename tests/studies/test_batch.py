@@ -81,6 +81,7 @@ def derivatives(batch):
     return jax.jit(every)(np.array([0.3, 0.7]), np.linspace(0.5, 2.0, 7))
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_a_batch():
     expected = derivatives(jax.vmap)
     for size in (3, None):

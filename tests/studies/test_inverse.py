@@ -302,6 +302,7 @@ def tractrix(ts):
     return np.stack([angle, blade * np.sin(angle), -blade * np.cos(angle)])
 
 
+@pytest.mark.slow
 def test_positions_that_a_blade_leaves_do_not_depend_on_the_times_asked_for():
     sleigh()  # Compiled outside of traces.
     several = jax.jit(jax.vmap(lambda ts: pulled(ts, *map(jnp.asarray, (BEHIND, SPEED, ANGLE)))))
@@ -397,6 +398,7 @@ def arms(names):
     return mb.Scene(bodies, joints=joints, forces=[mb.Gravity((0.0, -GRAVITY))]).compile()
 
 
+@pytest.mark.slow("few")
 @pytest.mark.parametrize(
     "names",
     [

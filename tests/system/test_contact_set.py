@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxmb as mb
 from jaxmb import spatial
@@ -29,6 +30,7 @@ def scene(contacts=True):
     return mb.Scene([body, cart], joints=joints, forces=[mb.Gravity((0.0, 0.0, -9.81)), *forces]).compile()
 
 
+@pytest.mark.slow
 def test_contact_set_has_the_laws_of_contacts_and_friction():
     system = scene()
     contacts, laws = system.contacts, system.contact_laws(0.0)

@@ -189,6 +189,7 @@ SERIES_REFUSED = [
 ]
 
 
+@pytest.mark.slow
 def test_inputs_that_cannot_be_are_refused(pendulum):
     for inputs, message in REFUSED:
         with pytest.raises(ValueError, match=message):
@@ -280,6 +281,7 @@ def test_inputs_have_a_rate_where_any_part_takes_it():
     assert counts
 
 
+@pytest.mark.slow
 def test_inputs_that_move_a_point_of_a_joint_count_in_its_rate():
     system = mb.with_inputs(sliding(), {"rail.point_a": MOVING})
     state = mb.assemble(system, t=2.0, fix={"rail.displacement": 0.3}, rates={"rail.displacement": 0.2})
@@ -312,7 +314,7 @@ def test_inputs_that_raise_the_ground_of_contacts():
     assert np.abs(expected - accelerations(still, u)).max() > 1.0
 
 
-@pytest.mark.slow("RollingDisc")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["RollingSphere", "RollingDisc"])
 def test_inputs_that_move_a_plane_of_rolling(kind):
     """As on a plane at rest, seen from the plane."""

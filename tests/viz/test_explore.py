@@ -35,6 +35,7 @@ def driven():
     return mb.with_inputs(system, {"motor.force": mb.Series(TS, 1.0 + TS)})
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_the_same_numbers(linkage):
     bounds = {"coupler.mass": (1.0, 5.0), "B.point_b[0]": (-3.0, -0.2), "crank.angle_rate": (0.0, 9.0)}
     variation = of(linkage.system, bounds, fix=linkage.fix, rates=linkage.rates, options=OPTIONS)
@@ -59,6 +60,7 @@ def test_motion_with_an_input_is_that_of_a_constant(driven):
     np.testing.assert_allclose(motion["bar"].angle, expected["bar"].angle, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_motion_keeps_to_a_way_of_assembly(linkage):
     """Once round, a linkage is where it was, and its joints are as fast as in the start."""
     pose = of(linkage.system, {"crank.angle": (-9.0, 9.0)}, state=linkage.state)
@@ -76,6 +78,7 @@ def chain(space, joints):
     return mb.Scene(bodies, joints=joints).compile()
 
 
+@pytest.mark.slow
 def test_sliders_turn_the_joints_that_determine_the_pose(linkage):
     names = lambda system, **start: [slider.name for slider in of(system, {}, **start).sliders]
     assert names(linkage.system) == ["A.angle"]
@@ -92,6 +95,7 @@ def test_sliders_turn_the_joints_that_determine_the_pose(linkage):
     assert found == ["h.angle", "c.angle", "c.displacement"]
 
 
+@pytest.mark.slow
 def test_curves_are_components_of_quantities(linkage):
     motion = of(linkage.system, {}, state=linkage.state, options=OPTIONS).motion({})
     found = curves(motion, ["rocker.angle", "A.force"])

@@ -34,6 +34,7 @@ def cantilever():
     return mb.Scene([rod], joints=[clamp], forces=[pull], frames=frames).compile()
 
 
+@pytest.mark.slow
 def test_bar_is_drawn_along_its_deflected_line():
     """A unit of the first mode bends a bar as a moment at its end does; parts are drawn where its frames are."""
     system = cantilever()
@@ -60,6 +61,7 @@ def test_deformation_is_magnified_from_the_undeformed_bar():
     np.testing.assert_allclose(thrice - straight, 3 * (once - straight), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_deformation_between_joints_is_magnified_from_the_chord():
     rod = planar.ElasticBar("rod", **BAR)
     pins = [
@@ -100,6 +102,7 @@ def test_elastic_body_is_drawn_to_its_frames():
     )
 
 
+@pytest.mark.slow("jaxmb.spatial")
 @pytest.mark.parametrize("space", [planar, spatial])
 def test_beam_is_drawn_along_its_sections(space):
     """The curve of a quarter turn is near an arc."""

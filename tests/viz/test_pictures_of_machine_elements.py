@@ -152,6 +152,7 @@ def test_tendon_is_a_cord_through_its_points():
     assert any(np.allclose(points, line.points[0, :, :2]) for points in drawn if points.shape == (3, 2))
 
 
+@pytest.mark.slow
 def test_ropes_end_in_blocks_of_the_ground():
     """But not on a drum of the ground."""
     block, drum = mb.Pulley("bob", 0.1, "left"), mb.Pulley("ground", 0.1, "left", centre=(0.5, 1.0))

@@ -61,7 +61,7 @@ RIGHT = [
 ]
 
 
-@pytest.mark.slow("30-0.01-0.01", "300-0.1-0.1", "30-0.01-None", "100-0.0-0.01", "2000-0.01-None")
+@pytest.mark.slow("30-0.01-0.01", "300-0.1-0.1", "30-0.01-None", "100-0.0-0.01", "2000-0.01-None", "300-0.1-None")
 @pytest.mark.parametrize("count, noise, sigma", RIGHT)
 def test_a_right_fit_is_not_accused(system, exact, count, noise, sigma):
     check_right_fit(system, exact, (count, noise, sigma), count)

@@ -44,6 +44,7 @@ def at_rest(system, **values):
     return mb.assemble(system, fix={name.replace("__", "."): value for name, value in values.items()})
 
 
+@pytest.mark.slow
 def test_algebraic_names_the_mode_that_no_input_moves():
     A, B, q = np.diag([1.0, -1.0, 2.0]), np.array([[0.0], [1.0], [1.0]]), np.ones(3)
     assert not algebraic(A, B, q, np.ones(1)).ok

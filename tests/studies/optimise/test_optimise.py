@@ -335,7 +335,7 @@ STATIONARY = [
 ]
 
 
-@pytest.mark.slow("optax")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["slsqp", optax.sgd(0.4)], ids=METHODS)
 def test_a_stationary_point_that_is_no_minimum(method):
     for is_tried, function, start, words in STATIONARY:

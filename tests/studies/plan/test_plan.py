@@ -74,6 +74,7 @@ def test_plan_of_least_effort_converges_to_the_exact_optimum_as_the_fourth_power
     np.testing.assert_allclose(torques, [FIRST_TORQUE, LAST_TORQUE], atol=0.01 * (32 / most) ** 2)
 
 
+@pytest.mark.slow
 def test_plan_simulated_in_one_run_arrives_at_its_end_on_the_constraints(planned):
     plan = planned("effort", 8)
     assert plan.arrival < 1e-7 and plan.integration_error < 1e-8
@@ -95,6 +96,7 @@ def test_refined_plan_of_least_time_moves_its_nodes(planned):
     np.testing.assert_allclose(moved.objective, LEAST_TIME, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_plan_of_least_time_switches_at_the_exact_time(planned):
     plan = planned("time", 6, "held")
     torque = np.asarray(plan.controls["motor.force"].values)[:-1]
@@ -104,6 +106,7 @@ def test_plan_of_least_time_switches_at_the_exact_time(planned):
     assert plan.active == ("motor.force",) and plan.duration == plan.objective
 
 
+@pytest.mark.slow
 def test_derivative_of_the_least_time_by_a_length_follows_from_multipliers(planned):
     """The exact derivative, at a constant mass of the coupler."""
     slopes = planned("time", 6, "held").derivatives("B.point_b", "C.point_a", "coupler.inertia")
@@ -201,6 +204,7 @@ def test_phases_of_one_system_are_one_plan_and_a_load_changes_the_second(system,
     assert max(first.arrival, second.arrival) < 1e-6
 
 
+@pytest.mark.slow
 def test_slsqp_finds_the_plan_of_ipopt(system, planned):
     options = {"controls": FREE, "duration": 2.0, "running": "effort", "start": REST, "end": TURNED, "intervals": 8}
     plan = mb.plan(system, method="slsqp", tol=1e-10, **options)
@@ -319,6 +323,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow("contradicts the constraints", "conditions of the start depend")
 @pytest.mark.parametrize(("change", "words"), REFUSED, ids=[words[:30] for _, words in REFUSED])
 def test_plan_refuses(system, change, words):
     with pytest.raises((ValueError, KeyError)) as error:

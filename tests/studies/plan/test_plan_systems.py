@@ -71,7 +71,7 @@ def test_sensitivities_at_active_bounds_are_differences_of_optima(system):
     np.testing.assert_allclose(found.controls["push.force"], slopes, rtol=0, atol=2e-3)
 
 
-@pytest.mark.slow("two")
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [pytest.param(2, id="two"), pytest.param(3, id="three")])
 def test_exact_second_derivatives_of_an_interval_are_differences_of_first_derivatives(monkeypatch, steps):
     """With a swinging load and a running cost."""
