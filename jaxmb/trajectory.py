@@ -29,7 +29,7 @@ from .linalg.arrays import ARRAYS, is_traced
 from .linalg.jitted import jitted
 from .linalg.members import vmap_states
 from .manifold.default import default_manifold
-from .manifold.impulse import after_jumps, next_number
+from .manifold.impulse import after_jumps
 from .manifold.orthogonal_projection import project_normalized
 from .parts.names import UnknownNameError, unknown
 from .solvers import Adams

@@ -103,10 +103,10 @@ class ContactEvents(eqx.Module):
     energies have those of their own times.
 
     The table begins with contacts that are closed, and friction that sticks or slips, from `t0` on: `at_start`, with
-    arrays in `start`. The other arrays have the events on the way only, and so have `list` and `len`. Impacts, slip and
-    other changes just at announced `jumps` or jumps of inputs, such as a brake that is let go, are part of the motion
-    and are not listed: the modes before and after tell them. A state that is saved just at an event may be the state
-    before it or after it. Times, impulses and energies have first derivatives; `rest` counts as a constant.
+    arrays in `start`. The other arrays have the events on the way only, and so have `list` and `len`. What changes at a
+    jump of an input, as where a brake is let go, or at announced `jumps` is an event just after the jump, and its time
+    is a constant. A state that is saved just at an event may be the state before it or after it. Times, impulses and
+    energies have first derivatives; `rest` counts as a constant.
 
     **Fields:**
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._types import Coordinates, Scalar, State
 from ..contacts.guards import ContactGuards
 from ..contacts.impacting import Event
+from ..solvers.directed import next_number
 from ..system.equation import AbstractEquation
 from ..system.instant import Instant
 from .orthogonal_projection import project_velocities
@@ -31,14 +32,6 @@ _VISIBLE, _ROUNDED = 1e-6, 1e-11
 _UNEVEN, _LEFT = 0.02, 0.01
 # Rows are examined at this number of configurations beside the state's.
 _OTHERS = 2
-
-
-def next_number(t: Float[Array, "*batch"], direction: Scalar) -> Float[Array, "*batch"]:
-    """The next larger number, or the next smaller one for a direction of −1; after zero the least normal number, as in
-    solvers that stop just before a jump.
-    """
-    sign = jnp.asarray(direction, t.dtype)
-    return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
 
 
 def after_jumps(

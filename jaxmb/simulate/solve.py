@@ -150,7 +150,8 @@ class End(NamedTuple):
         if events is not None:
             t0, given = start
             first = t0, ravel_pytree(dataclasses.replace(given, angles=None))[0]
-            contact_events = FoundEvents(events.count, events.times[:-1], events.states[:-1], events.touch, first, t)
+            times = stops.moving(events.times[:-1])
+            contact_events = FoundEvents(events.count, times, events.states[:-1], events.touch, first, t)
             if stops.event is not None:
                 # The last step is cut off at the user's event, before the events at its end.
                 later = jnp.isfinite(contact_events.times) & (contact_events.times > t)

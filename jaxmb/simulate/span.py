@@ -17,7 +17,7 @@ from jax import lax
 
 from .._arguments import real_array
 from ..linalg.arrays import is_traced
-from ..manifold.impulse import next_number
+from ..solvers.directed import next_number
 from ..solvers.times import twice_differentiable
 
 _FROZEN = contextvars.ContextVar("frozen", default=False)

@@ -5,11 +5,14 @@ from typing import Any, NamedTuple
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
 
 from .._arguments import real_array
 from .._types import State
 from ..linalg.arrays import is_traced
 from ..linalg.recent import Recent
+from ..solvers.directed import next_number
 from ..solvers.events import EventController
 from ..system import AbstractSystem
 from ..system.inputs import input_break_times, turning_times
@@ -33,10 +36,19 @@ class Stops(NamedTuple):
 
     def around(self, controller: Any, contacts: bool) -> Any:
         """A controller that steps to these times and restarts there, and at events of `contacts`."""
-        controller = EventController(controller, self.max_events) if contacts else controller
+        controller = EventController(controller, self.max_events, self.restarts) if contacts else controller
         if self.restarts is None and self.turns is None:
             return controller
         return diffrax.ClipStepSizeController(controller, step_ts=self.turns, jump_ts=self.restarts)
+
+    def moving(self, times: Float[Array, "events"]) -> Float[Array, "events"]:
+        """Times of events, of which those at jumps have the derivatives of the jumps."""
+        if self.restarts is None:
+            return times
+        jumps = jnp.asarray(self.restarts)
+        fixed = lax.stop_gradient(jumps)
+        moves = jnp.where(times[:, None] == next_number(fixed, 1), jumps - fixed, 0.0)
+        return times + jnp.sum(moves, axis=1)
 
 
 def turns_of(system: AbstractSystem, state: State, t0: Any, t1: Any, controller: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Terms in the time of a solver, which always increases."""
+"""Terms in the time of a solver, which always increases, and the next number in a direction of time."""
 
 from typing import Any
 
@@ -37,6 +37,14 @@ class Directed(diffrax.AbstractTerm):
     def _ends(self, t0, t1):
         forward = self.direction == 1
         return jnp.where(forward, t0, -t1), jnp.where(forward, t1, -t0)
+
+
+def next_number(t: Any, direction: Any) -> Any:
+    """The next larger number, or the next smaller one for a direction of −1; after zero the least normal number, as in
+    solvers that stop just before a jump.
+    """
+    sign = jnp.asarray(direction, t.dtype)
+    return jnp.where(t == 0, sign * jnp.finfo(t.dtype).tiny, jnp.nextafter(t, sign * jnp.inf))
 
 
 def directed(terms: PyTree, direction: Any) -> PyTree:

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._branches import cond_of_any_lane, cond_of_lanes, loop_of_lanes
 from .controller import AbstractControllerAround, AbstractControllerState, intended_step, states_inside
+from .directed import next_number
 from .evaluation import ravel
 from .manifold_term import AbstractGuards
 from .packing import Layout, switch
@@ -415,7 +416,7 @@ class EventState(AbstractControllerState):
     made to end, else infinite; `length` of the attempted step before it was shortened; the `count` of events, their
     `times` and the raveled `states` before them, in buffers; `touch` of the guards; `halved`: how many times in a row a
     step was halved; `starts`: whether the method restarts with this step; `start`: the length that the error of the
-    last start allows; `ended`: whether the last step ended at an event.
+    last start allows; `ended`: whether the last step ended at an event or a jump that is recorded.
     """
 
     inner: Any
@@ -438,14 +439,18 @@ class EventState(AbstractControllerState):
 class EventController(AbstractControllerAround):
     """Wraps a controller so that steps end at events, at most `most` events.
 
+    Jumps at known times, by a `diffrax.ClipStepSizeController` around this one, are recorded as events as well, just
+    after them, since contacts and friction may change there. Those without a change take no place.
+
     The solve ends with `diffrax.RESULTS.dt_min_reached` after too many events, and with `NO_STATE` if an event leads to
     no state.
     """
 
     controller: Any
     most: int = eqx.field(static=True)
+    jumps: Float[Array, " jumps"] | None
 
-    def __init__(self, controller: Any, most: int):
+    def __init__(self, controller: Any, most: int, jumps: ArrayLike | None = None):
         if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
             raise ValueError(
                 f"With contacts or dry friction steps end at events, which {type(controller).__name__} does not allow: "
@@ -453,6 +458,18 @@ class EventController(AbstractControllerAround):
             )
         self.controller = controller
         self.most = most
+        self.jumps = None if jumps is None else jnp.asarray(jumps)
+
+    def wrap(self, direction):
+        jumps = None if self.jumps is None else self.jumps * direction
+        return EventController(self.controller.wrap(direction), self.most, jumps)
+
+    def _jump_after(self, t):
+        """Whether the controller around this one ends a step at a time to make a jump, and the time after it."""
+        if self.jumps is None:
+            return jnp.array(False), t
+        at = (self.jumps > t) & (self.jumps <= next_number(next_number(t, 1), 1))
+        return jnp.any(at), next_number(jnp.min(jnp.where(at, self.jumps, jnp.inf)), 1)
 
     def init(self, terms, t0: Any, t1, y0, dt0, args, func, error_order):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -493,19 +510,22 @@ class EventController(AbstractControllerAround):
         # The next event overwrites an event that changed nothing.
         idle = plan.accepted & before.ended & (crossing.idle > 0)
         count = before.count - idle.astype(before.count.dtype)
-        place = jnp.where(plan.ends, jnp.minimum(count, self.most), self.most)
+        jumps, after = self._jump_after(t1)
+        jumps = jumps & plan.accepted & (count < self.most)
+        ends = plan.ends | jumps
+        place = jnp.where(ends, jnp.minimum(count, self.most), self.most)
         state = EventState(
             plan.inner,
             plan.target,
             plan.length,
-            count + plan.ends.astype(count.dtype),
-            lax.dynamic_update_index_in_dim(before.times, t1, place, 0),
+            count + ends.astype(count.dtype),
+            lax.dynamic_update_index_in_dim(before.times, jnp.where(jumps, after, t1), place, 0),
             lax.dynamic_update_index_in_dim(before.states, ravel(y1_candidate), place, 0),
             crossing.touch,
             plan.halved,
             plan.starts,
             plan.start,
-            plan.ended,
+            plan.ended | ends,
         )
         full = plan.ends & (count >= self.most)
         result = diffrax.RESULTS.where(full, diffrax.RESULTS.dt_min_reached, result)

@@ -315,8 +315,7 @@ def ball_that_is_lifted_after_an_event():
     floor = mb.RigidContact("floor", "ball", terrain=FLAT, radius=0.2)
     lift = mb.Force("lift", "ball", lambda x, v, t, p: jnp.stack([0.0 * t, jnp.where(t > 1, 30.0, 0.0), 0.0 * t]))
     system = mb.Scene([body], joints=[floor], forces=[DOWN, lift]).compile()
-    # What happens at an announced jump is part of the motion and not listed.
-    events = [("floor", "close", np.sqrt(2 / G))]
+    events = [("floor", "close", np.sqrt(2 / G)), ("floor", "open", 1.0)]
     values = {"ball.position": [0.0, 0.2 + risen(30.0, 0.3)]}
     return Scenario(system, 1.3, events, values, options={"jumps": [1.0], "rtol": 1e-8}, near=1e-7)
 

@@ -489,8 +489,7 @@ def brake_that_fails_on_a_slope(way):
     times, weights = begins + (end - begins) * (times + 1) / 2, weights * (end - begins) / 2
     rate = -G * weights @ (np.sin(slope) - coefficient(times) * np.cos(slope))
     values = {"rail.displacement_rate": [0.0, rate]}
-    events = [] if way == "jump" else [("rub", "slip", begins)]
-    system = slider(slope, 0.0, coefficient=0.3)
+    system, events = slider(slope, 0.0, coefficient=0.3), [("rub", "slip", begins)]
     return Scenario(system, end, events, values, (0.25, end), options={"inputs": {"rub.coefficient": brake}}, near=1e-7)
 
 
