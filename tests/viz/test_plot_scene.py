@@ -62,7 +62,7 @@ def test_plot_scene_writes_chosen_names_and_those_of_open_joints():
     system = four_bar().compile()
     state = mb.assemble(system, fix={"crank.angle": 1.0})
     assert read(viz.plot_scene(system, state, names=[]))[0] == set()
-    with pytest.raises(ValueError, match="Unknown body or joint .rood.*rod"):
+    with pytest.raises(ValueError, match=r"Unknown body or joint .rood.*rod"):
         viz.plot_scene(system, names=["rood"])
 
 
