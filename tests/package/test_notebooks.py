@@ -156,6 +156,7 @@ def test_pictures_and_links_of_the_readme_are_there():
     assert all((ROOT / name).is_file() for name in linked)
 
 
+@pytest.mark.slow
 def test_half_car():
     """The numbers that notebook 15 compares its half-car with are those of Lagrange's equations."""
     cells = nbformat.read(FOLDER / "15_others.ipynb", as_version=4).cells
