@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from compiling import QUICKLY
 from execute_notebooks import FOLDER, GALLERY, difference, digest, executed, printed, readme_examples
+from oracles.half_car import heave_and_roll
 from PIL import Image
 
 import jaxmb as mb
@@ -153,3 +154,14 @@ def test_pictures_and_links_of_the_readme_are_there():
     linked = re.findall(r"notebooks/[\w.]+", text)
     assert {path.name for path in NOTEBOOKS} < {Path(name).name for name in linked}
     assert all((ROOT / name).is_file() for name in linked)
+
+
+@pytest.mark.slow
+def test_half_car():
+    """The numbers that notebook 15 compares its half-car with are those of Lagrange's equations."""
+    cells = nbformat.read(FOLDER / "15_others.ipynb", as_version=4).cells
+    (source,) = [cell.source for cell in cells if "BY_LAGRANGE =" in cell.source]
+    scope: dict = {}
+    exec(source[source.index("BY_LAGRANGE =") : source.index("\n}") + 2], scope)
+    times, values = zip(*scope["BY_LAGRANGE"].items(), strict=True)
+    np.testing.assert_allclose(1e3 * heave_and_roll(times), values, rtol=0.0, atol=1e-6)
