@@ -47,7 +47,8 @@ class Stops(NamedTuple):
             return times
         jumps = jnp.asarray(self.restarts)
         fixed = lax.stop_gradient(jumps)
-        moves = jnp.where(times[:, None] == next_number(fixed, 1), jumps - fixed, 0.0)
+        at = times[:, None] == next_number(fixed, 1)[None, :]
+        moves = jnp.where(at, (jumps - fixed)[None, :], 0.0)
         return times + jnp.sum(moves, axis=1)
 
 
