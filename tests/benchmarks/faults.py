@@ -889,6 +889,8 @@ FAULTS = [
         "accepted=yes, next_t1=next_t1, starts=starts, start=start, ended=no",
         "accepted=yes, next_t1=next_t1, starts=starts, start=start, ended=yes",
     ),
+    Fault("solvers/events.py", "jnp.where(jumps, after, t1)", "t1"),
+    Fault("simulate/stops.py", "return times + jnp.sum(moves, axis=1)", "return times - jnp.sum(moves, axis=1)"),
     Fault("solvers/hermite.py", "used.size), dtype) @ (1 / (formula.end", "used.size), dtype) @ (2 / (formula.end"),
     Fault("solvers/mesh.py", "lw = lw + table[0]", "lw = lw"),
     Fault("solvers/mesh.py", "jnp.where(is_last, c, 0)", "jnp.where(is_last, 0, c)"),

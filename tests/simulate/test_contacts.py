@@ -449,6 +449,25 @@ def pull_that_sets_in_and_ends():
 
 
 @derived
+def slider_that_is_let_go():
+    """Time and speed by the time at which a brake is let go, and by gravity."""
+    slider = planar.Body("slider", mass=1.3, inertia=1.0)
+    rail = planar.Prismatic("rail", "ground", "slider", point=(0.0, 0.0), axis=(0.0, 1.0))
+    brake = mb.JointFriction("brake", "rail.displacement", force=20.0, static_force=20.0, exact=True)
+    system = mb.Scene([slider], joints=[rail], forces=[DOWN, brake]).compile()
+    start = mb.assemble(system)
+
+    def end(x, rtol):
+        let_go = lambda t: jnp.where(t < x[0], 20.0, 0.0)
+        own = mb.with_parameters(system, {"gravity.acceleration": x[1] * jnp.array([0.0, -1.0])})
+        inputs = {"brake.force": let_go, "brake.static_force": let_go}
+        motion = mb.simulate(own, start, t1=1.0, inputs=inputs, jumps=x[:1], rtol=rtol, max_steps=200, max_events=4)
+        return jnp.stack([motion.events.times[0], motion["slider"].velocity[-1, 1]])
+
+    return Derived(end, [0.3, G], lambda x: jnp.stack([x[0], -x[1] * (1.0 - x[0])]))
+
+
+@derived
 def ball_on_a_floor_that_vibrates():
     """It lands without a rebound, rides, and lifts off where the floor falls as gravity does."""
     floor = mb.RigidContact("floor", "ball", terrain=FLAT)

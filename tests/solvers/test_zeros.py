@@ -98,6 +98,23 @@ def test_an_event_counts_unless_it_changes_nothing():
     np.testing.assert_array_equal(counted(1.0), [2, 2, 2])
 
 
+def test_a_jump_is_an_event_just_after_it_unless_it_changes_nothing():
+    """Steps end just before jumps, at 2 and 4, the second of which changes nothing; 6 is no jump."""
+    jumps, one = jnp.array([4.0, 2.0]), jnp.ones(())
+    controller = events.EventController(diffrax.PIDController(1e-6, 1e-6), 5, jumps)
+    state = controller.init(None, one, 9 * one, one, one, None, None, 5.0)[1]
+    none, found = jnp.zeros(()), []
+    for end, idle in ((2.0, 0.0), (4.0, 0.0), (6.0, 1.0)):
+        crossing = events.Crossing(
+            none, jnp.inf, none, one, none, none, none, 1e-9 * one, 1e-7 * one, jnp.inf * one, idle * one
+        )
+        before = jnp.nextafter(jnp.array(end), 0.0)
+        state = controller.adapt_step_size(before - 1, before, one, end * one, None, crossing, 5.0, state)[4]
+        found.append((int(state.count), state.times[0], state.states[0, 0]))
+    after = np.nextafter(2.0, 9.0)
+    assert found == [(1, after, 2.0), (2, after, 2.0), (1, after, 2.0)]
+
+
 class Slip(AbstractGuards):
     """A guard that is the state, and may begin at the start of a step."""
 
