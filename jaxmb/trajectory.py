@@ -33,6 +33,7 @@ from .manifold.impulse import after_jumps
 from .manifold.orthogonal_projection import project_normalized
 from .parts.names import UnknownNameError, unknown
 from .solvers import Adams
+from .solvers.directed import next_number
 from .system import AbstractSystem
 from .system.instant import Instant
 from .system.picture import Picture, joined_pictures

@@ -70,7 +70,7 @@ RUNS = {
 }
 
 
-@pytest.mark.slow(but=("contacts",))
+@pytest.mark.slow(but=("dense", "contacts"))
 @pytest.mark.parametrize("name", RUNS)
 def test_results_do_not_depend_on_where_a_call_ends(name, monkeypatch):
     """To the last bit."""
