@@ -104,9 +104,9 @@ class ContactEvents(eqx.Module):
 
     The table begins with contacts that are closed, and friction that sticks or slips, from `t0` on: `at_start`, with
     arrays in `start`. The other arrays have the events on the way only, and so have `list` and `len`. What changes at a
-    jump of an input, as where a brake is let go, or at announced `jumps` is an event just after the jump, and its time
-    is a constant. A state that is saved just at an event may be the state before it or after it. Times, impulses and
-    energies have first derivatives; `rest` counts as a constant.
+    jump of an input, as where a brake is let go, or at announced `jumps` is an event just after the jump; its time has
+    the derivative of the jump's time. A state that is saved just at an event may be the state before it or after it.
+    Times, impulses and energies have first derivatives; `rest` counts as a constant.
 
     **Fields:**
 

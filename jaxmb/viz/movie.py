@@ -55,8 +55,8 @@ def save_movie(
     **Returns:** the path.
 
     **Raises:** `ValueError` for another kind of file, a batch, a motion saved at fewer than two times, states that are
-    not finite, and a system without bodies; `RuntimeError` for a film without the program `ffmpeg`; `ImportError`
-    without matplotlib.
+    not finite, unknown bodies, and a system without bodies; `RuntimeError` for a film without the program `ffmpeg`;
+    `ImportError` without matplotlib.
     """
     path = Path(path)
     if path.suffix not in _WRITERS:
